@@ -3,7 +3,8 @@
 use blaze_domain::word_enum;
 
 word_enum!(
-    /// Signature of a token. The algorithm belongs to the key: what a token says of itself only has to agree.
+    /// Signature of a token. The algorithm belongs to the key: what a token says of itself only has
+    /// to agree.
     Algorithm {
         /// HMAC with SHA-256: who can check a token can also make one.
         Hs256 = "HS256",

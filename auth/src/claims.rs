@@ -23,7 +23,8 @@ word_enum!(
 pub struct Claims {
     /// `sub`.
     pub subject: String,
-    /// `roles` as they stand in the token. One that is unknown makes every request 403, so it is kept.
+    /// `roles` as they stand in the token. One that is unknown makes every request 403, so it is
+    /// kept.
     pub roles: Vec<String>,
     /// `layer`: nothing outside its view is seen.
     pub layer: Option<LayerName>,
@@ -34,11 +35,10 @@ pub struct Claims {
 }
 
 impl Claims {
-    /// Whether the token has run out at `now_s` (seconds since 1970), leeway included. What was accepted once is to be
-    /// asked again while it is in use: a stream may outlive its token.
+    /// Whether the token has run out at `now_s` (seconds since 1970), leeway included. What was
+    /// accepted once is to be asked again while it is in use: a stream may outlive its token.
     #[must_use]
     pub fn is_expired(&self, now_s: i64) -> bool {
-        self.expires_s
-            .is_some_and(|expires_s| now_s.saturating_sub(LEEWAY_S) >= expires_s)
+        self.expires_s.is_some_and(|expires_s| now_s.saturating_sub(LEEWAY_S) >= expires_s)
     }
 }

@@ -22,8 +22,8 @@ pub struct Jwks {
     pub ignored: Vec<String>,
 }
 
-/// Reads a JWK set: RSA keys for RS256 and Ed25519 keys for EdDSA that may check signatures. Others are left out: a set
-/// may hold keys for other purposes.
+/// Reads a JWK set: RSA keys for RS256 and Ed25519 keys for EdDSA that may check signatures. Others
+/// are left out: a set may hold keys for other purposes.
 ///
 /// # Errors
 /// If the text is no JWK set.
@@ -69,7 +69,9 @@ fn read_jwk(members: &Map<String, Value>) -> Result<(Option<String>, VerifyKey),
     let algorithm = match (text("kty")?, text("crv")?) {
         (Some("RSA"), _) => Algorithm::Rs256,
         (Some("OKP"), Some("Ed25519")) => Algorithm::EdDsa,
-        (Some("oct"), _) => return Err("is symmetric: whoever reads the set could sign with it".to_owned()),
+        (Some("oct"), _) => {
+            return Err("is symmetric: whoever reads the set could sign with it".to_owned());
+        }
         (kty, _) => {
             let found = shown(kty.unwrap_or("none"));
             return Err(format!("is of kty {found}; RSA and OKP with Ed25519 are used"));
@@ -78,7 +80,8 @@ fn read_jwk(members: &Map<String, Value>) -> Result<(Option<String>, VerifyKey),
     if let Some(said) = text("alg")?.filter(|said| *said != algorithm.as_str()) {
         return Err(format!("is for {}, not for {algorithm}", shown(said)));
     }
-    if text("use")?.is_some_and(|purpose| purpose != "sig") || !may_verify(members.get("key_ops"))? {
+    if text("use")?.is_some_and(|purpose| purpose != "sig") || !may_verify(members.get("key_ops"))?
+    {
         return Err("is not for checking signatures".to_owned());
     }
     if members.contains_key("d") {
@@ -87,10 +90,8 @@ fn read_jwk(members: &Map<String, Value>) -> Result<(Option<String>, VerifyKey),
     let key = match algorithm {
         Algorithm::Rs256 => {
             let (modulus, exponent) = (bytes("n")?, bytes("e")?);
-            let components = RsaPublicKeyComponents {
-                n: without_zeros(&modulus),
-                e: without_zeros(&exponent),
-            };
+            let components =
+                RsaPublicKeyComponents { n: without_zeros(&modulus), e: without_zeros(&exponent) };
             let spki: Result<PublicKeyX509Der<'_>, _> = components.as_der();
             let spki = spki.map_err(|_| "has no RSA key in n and e".to_owned())?;
             public_key(algorithm, spki.as_ref())
@@ -104,7 +105,9 @@ fn read_jwk(members: &Map<String, Value>) -> Result<(Option<String>, VerifyKey),
 fn may_verify(key_ops: Option<&Value>) -> Result<bool, String> {
     match key_ops {
         None => Ok(true),
-        Some(Value::Array(operations)) => Ok(operations.iter().any(|operation| operation == "verify")),
+        Some(Value::Array(operations)) => {
+            Ok(operations.iter().any(|operation| operation == "verify"))
+        }
         Some(_) => Err("has key_ops that is no array".to_owned()),
     }
 }

@@ -50,16 +50,13 @@ pub fn generate_key(algorithm: Algorithm) -> Result<GeneratedKey, String> {
         Algorithm::EdDsa => {
             // Version 1 is what every tool reads.
             let private = Ed25519KeyPair::generate_pkcs8v1(&SystemRandom::new()).map_err(failed)?;
-            let pair =
-                Ed25519KeyPair::from_pkcs8(private.as_ref()).map_err(|_| failed(aws_lc_rs::error::Unspecified))?;
+            let pair = Ed25519KeyPair::from_pkcs8(private.as_ref())
+                .map_err(|_| failed(aws_lc_rs::error::Unspecified))?;
             let public: PublicKeyX509Der<'_> = pair.public_key().as_der().map_err(failed)?;
             (pem("PRIVATE KEY", private.as_ref()), pem("PUBLIC KEY", public.as_ref()))
         }
     };
-    Ok(GeneratedKey {
-        private,
-        public: Some(public.as_str().to_owned()),
-    })
+    Ok(GeneratedKey { private, public: Some(public.as_str().to_owned()) })
 }
 
 /// The file of a new key for `control_plane.encryption`: 32 random bytes as base64.

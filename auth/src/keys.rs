@@ -23,13 +23,17 @@ pub enum KeyError {
         found: usize,
     },
     /// A PEM file may be public, and then anybody could sign.
-    #[error("holds PEM text, which is no HS256 key; take random bytes, or set alg to RS256 or EdDSA")]
+    #[error(
+        "holds PEM text, which is no HS256 key; take random bytes, or set alg to RS256 or EdDSA"
+    )]
     SecretIsPem,
     /// No PEM, or another number of sections than one.
     #[error("holds no single key in PEM form ({0})")]
     Pem(String),
     /// PEM of something else.
-    #[error("holds a PEM section {found:?}; {algorithm} needs PUBLIC KEY (SPKI) or PRIVATE KEY (PKCS#8)")]
+    #[error(
+        "holds a PEM section {found:?}; {algorithm} needs PUBLIC KEY (SPKI) or PRIVATE KEY (PKCS#8)"
+    )]
     Section {
         /// What the key should be for.
         algorithm: Algorithm,
@@ -113,8 +117,8 @@ pub struct Key {
     pub sign: Option<SignKey>,
 }
 
-/// Reads a key file. HS256: the file's bytes less one newline at the end. RS256, EdDSA: one PEM section, SPKI or
-/// PKCS#8; with `needs_sign` PKCS#8.
+/// Reads a key file. HS256: the file's bytes less one newline at the end. RS256, EdDSA: one PEM
+/// section, SPKI or PKCS#8; with `needs_sign` PKCS#8.
 ///
 /// # Errors
 /// [`KeyError`].
@@ -139,10 +143,7 @@ fn secret(file: &[u8]) -> Result<Key, KeyError> {
     }
     Ok(Key {
         verify: VerifyKey::new(Algorithm::Hs256, DecodingKey::from_secret(bytes)),
-        sign: Some(SignKey {
-            algorithm: Algorithm::Hs256,
-            key: EncodingKey::from_secret(bytes),
-        }),
+        sign: Some(SignKey { algorithm: Algorithm::Hs256, key: EncodingKey::from_secret(bytes) }),
     })
 }
 

@@ -1,5 +1,5 @@
-//! Tokens of the configuration service: JWTs that are signed, checked, and turned into rights. Plain functions over
-//! bytes; files, network and clocks belong to who calls.
+//! Tokens of the configuration service: JWTs that are signed, checked, and turned into rights.
+//! Plain functions over bytes; files, network and clocks belong to who calls.
 //!
 //! ```text
 //! key files, JWKS ─[read_key, read_jwks]─▶ KeySet ─┐
@@ -7,8 +7,8 @@
 //! subject, roles, … + SignKey ─[sign]─▶ token
 //! ```
 //!
-//! The server and the command line share it: a token that `blaze token create --key-file` makes is one that the server
-//! takes.
+//! The server and the command line share it: a token that `blaze token create --key-file` makes is
+//! one that the server takes.
 
 mod algorithm;
 mod claims;
@@ -55,9 +55,6 @@ pub struct Realm {
 
 impl Default for Realm {
     fn default() -> Self {
-        Self {
-            issuer: "blaze".to_owned(),
-            audience: "blaze-config".to_owned(),
-        }
+        Self { issuer: "blaze".to_owned(), audience: "blaze-config".to_owned() }
     }
 }

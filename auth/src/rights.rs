@@ -39,8 +39,8 @@ const RIGHTS: &[(Role, &[Right])] = &[
 /// Whether the roles of a token give a right; several add up.
 ///
 /// # Errors
-/// Why not, for log and audit alone. One unknown role refuses everything: what it was meant to allow or to forbid is
-/// not known here.
+/// Why not, for log and audit alone. One unknown role refuses everything: what it was meant to
+/// allow or to forbid is not known here.
 pub fn allowed(claims: &Claims, right: Right) -> Result<(), String> {
     let mut granted = false;
     for text in &claims.roles {
@@ -54,17 +54,17 @@ pub fn allowed(claims: &Claims, right: Right) -> Result<(), String> {
     }
 }
 
-/// Whether a token is bound to no layer: what concerns the whole system (audit, tokens, trim) is outside every layer's
-/// view.
+/// Whether a token is bound to no layer: what concerns the whole system (audit, tokens, trim) is
+/// outside every layer's view.
 ///
 /// # Errors
 /// Which layer it is bound to, for log and audit alone.
 pub fn unbound(claims: &Claims) -> Result<(), String> {
     match &claims.layer {
         None => Ok(()),
-        Some(layer) => Err(format!(
-            "the token is bound to layer {layer}; this concerns the whole system"
-        )),
+        Some(layer) => {
+            Err(format!("the token is bound to layer {layer}; this concerns the whole system"))
+        }
     }
 }
 
@@ -107,10 +107,7 @@ mod tests {
             assert!(allowed(&claims(roles), Right::Read).is_err(), "{roles:?}");
         }
         assert!(unbound(&claims(&["admin"])).is_ok());
-        let bound = Claims {
-            layer: Some("edge".parse().unwrap()),
-            ..claims(&["admin"])
-        };
+        let bound = Claims { layer: Some("edge".parse().unwrap()), ..claims(&["admin"]) };
         assert!(unbound(&bound).unwrap_err().contains("edge"));
     }
 }

@@ -41,17 +41,13 @@ impl KeySet {
         match (kid, self.keys.as_slice()) {
             (Some(kid), keys) => {
                 let found = keys.iter().find(|(id, _)| id.as_deref() == Some(kid));
-                found
-                    .map(|(_, key)| key)
-                    .ok_or_else(|| Refusal::UnknownKey(kid.to_owned()))
+                found.map(|(_, key)| key).ok_or_else(|| Refusal::UnknownKey(kid.to_owned()))
             }
             (None, [(_, key)]) => Ok(key),
             (None, []) => Err(Refusal::Invalid("there is no key to check tokens with".to_owned())),
             (None, keys) => {
                 let count = keys.len();
-                Err(Refusal::Invalid(format!(
-                    "the token has no kid, and there are {count} keys"
-                )))
+                Err(Refusal::Invalid(format!("the token has no kid, and there are {count} keys")))
             }
         }
     }

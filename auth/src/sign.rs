@@ -32,7 +32,9 @@ impl NewToken<'_> {
     pub fn check(&self) -> Result<(), String> {
         bounded("subject", self.subject, MAX_SUBJECT_BYTES)?;
         if self.roles.is_empty() {
-            return Err("roles is empty; name at least one of viewer, operator, admin, worker".to_owned());
+            return Err(
+                "roles is empty; name at least one of viewer, operator, admin, worker".to_owned()
+            );
         }
         for (index, role) in self.roles.iter().enumerate() {
             let role: Role = role.parse().map_err(|error| format!("role {error}"))?;
@@ -57,7 +59,12 @@ impl NewToken<'_> {
 ///
 /// # Errors
 /// As [`NewToken::check`], or that the key cannot sign.
-pub fn sign(realm: &Realm, kid: Option<&str>, key: &SignKey, token: &NewToken<'_>) -> Result<String, String> {
+pub fn sign(
+    realm: &Realm,
+    kid: Option<&str>,
+    key: &SignKey,
+    token: &NewToken<'_>,
+) -> Result<String, String> {
     token.check()?;
     let mut header = Header::new(key.algorithm.of_library());
     header.kid = kid.map(str::to_owned);
@@ -97,7 +104,8 @@ pub fn sign_locally(
     kid: Option<&str>,
     token: &NewToken<'_>,
 ) -> Result<String, String> {
-    let key = read_key(algorithm, key_file, true).map_err(|error| format!("the key file {error}"))?;
+    let key =
+        read_key(algorithm, key_file, true).map_err(|error| format!("the key file {error}"))?;
     let key = key.sign.ok_or("the key file cannot sign")?;
     sign(realm, kid, &key, token)
 }

@@ -37,10 +37,9 @@ fn files(algorithm: Algorithm) -> (&'static [u8], &'static [u8]) {
     match algorithm {
         Algorithm::Hs256 => (SECRET, SECRET),
         Algorithm::Rs256 => (rsa_files().0.as_bytes(), rsa_files().1.as_bytes()),
-        Algorithm::EdDsa => (
-            ed_files().private.as_bytes(),
-            ed_files().public.as_ref().unwrap().as_bytes(),
-        ),
+        Algorithm::EdDsa => {
+            (ed_files().private.as_bytes(), ed_files().public.as_ref().unwrap().as_bytes())
+        }
     }
 }
 
@@ -71,7 +70,13 @@ fn good(algorithm: Algorithm, kid: Option<&str>) -> String {
 }
 
 fn good_claims() -> Value {
-    json!({ "iss": "blaze", "aud": "blaze-config", "sub": "ops", "exp": NOW_S + 60, "roles": ["viewer"] })
+    json!({
+        "iss": "blaze",
+        "aud": "blaze-config",
+        "sub": "ops",
+        "exp": NOW_S + 60,
+        "roles": ["viewer"],
+    })
 }
 
 /// A token of any form, signed with [`SECRET`].
@@ -82,7 +87,9 @@ fn raw(header: &Value, claims: &str) -> String {
         to_base64url(claims.as_bytes())
     );
     let key = EncodingKey::from_secret(SECRET);
-    let signature = jsonwebtoken::crypto::sign(message.as_bytes(), &key, jsonwebtoken::Algorithm::HS256).unwrap();
+    let signature =
+        jsonwebtoken::crypto::sign(message.as_bytes(), &key, jsonwebtoken::Algorithm::HS256)
+            .unwrap();
     format!("{message}.{signature}")
 }
 
@@ -167,10 +174,7 @@ fn bad_key_files_are_refused() {
         read_key(Algorithm::Hs256, short, false).unwrap_err(),
         KeyError::ShortSecret { found: 31 }
     );
-    assert_eq!(
-        read_key(Algorithm::Hs256, rsa.1, false).unwrap_err(),
-        KeyError::SecretIsPem
-    );
+    assert_eq!(read_key(Algorithm::Hs256, rsa.1, false).unwrap_err(), KeyError::SecretIsPem);
     for (algorithm, file) in [(Algorithm::Rs256, ed), (Algorithm::EdDsa, rsa)] {
         for file in [file.0, file.1] {
             assert_eq!(
@@ -191,10 +195,7 @@ fn bad_key_files_are_refused() {
 #[test]
 fn a_small_rsa_key_is_refused() {
     let modulus = [0xb5_u8; 128];
-    let small = RsaPublicKeyComponents {
-        n: &modulus[..],
-        e: &[1, 0, 1][..],
-    };
+    let small = RsaPublicKeyComponents { n: &modulus[..], e: &[1, 0, 1][..] };
     let spki: PublicKeyX509Der<'_> = small.as_der().unwrap();
     let file = pem("PUBLIC KEY", spki.as_ref());
     let found = read_key(Algorithm::Rs256, file.as_bytes(), false).unwrap_err();
@@ -210,7 +211,8 @@ fn the_algorithm_belongs_to_the_key() {
     let public = files(Algorithm::Rs256).1;
     let mut forged_header = Header::new(jsonwebtoken::Algorithm::HS256);
     forged_header.kid = Some("k1".to_owned());
-    let forged = jsonwebtoken::encode(&forged_header, &claims, &EncodingKey::from_secret(public)).unwrap();
+    let forged =
+        jsonwebtoken::encode(&forged_header, &claims, &EncodingKey::from_secret(public)).unwrap();
     let refusal = verify(&forged, &rsa_only, &Realm::default(), NOW_S).unwrap_err();
     assert!(refusal.to_string().contains("alg"), "{refusal}");
 
@@ -219,10 +221,7 @@ fn the_algorithm_belongs_to_the_key() {
         let token = raw(&json!({ "alg": algorithm }), &claims.to_string());
         assert!(verify(&token, &keys, &Realm::default(), NOW_S).is_err(), "{algorithm}");
         let unsigned = format!("{}.", token.rsplit_once('.').unwrap().0);
-        assert!(
-            verify(&unsigned, &keys, &Realm::default(), NOW_S).is_err(),
-            "{algorithm}"
-        );
+        assert!(verify(&unsigned, &keys, &Realm::default(), NOW_S).is_err(), "{algorithm}");
     }
 }
 
@@ -254,10 +253,7 @@ fn headers_are_read_strictly() {
     assert!(verify(&token, &keys, &Realm::default(), NOW_S).is_err());
     let long = raw(&json!({ "alg": "HS256", "x": "y".repeat(8_000) }), &claims);
     assert!(
-        verify(&long, &keys, &Realm::default(), NOW_S)
-            .unwrap_err()
-            .to_string()
-            .contains("8192")
+        verify(&long, &keys, &Realm::default(), NOW_S).unwrap_err().to_string().contains("8192")
     );
     for text in ["", ".", "..", "...", "a.b.c", "a.b", "Bearer x.y.z", "ä.ö.ü"] {
         assert!(verify(text, &keys, &Realm::default(), NOW_S).is_err(), "{text}");
@@ -281,14 +277,12 @@ fn with_several_keys_a_kid_is_needed() {
     assert_eq!(unknown, Err(Refusal::UnknownKey("k3".to_owned())));
     let mut first = KeySet::new();
     let (hs, ed) = (files(Algorithm::Hs256).1, files(Algorithm::EdDsa).1);
-    assert!(first.add(
-        Some("k1".to_owned()),
-        read_key(Algorithm::Hs256, hs, false).unwrap().verify
-    ));
-    assert!(!first.add(
-        Some("k1".to_owned()),
-        read_key(Algorithm::EdDsa, ed, false).unwrap().verify
-    ));
+    assert!(
+        first.add(Some("k1".to_owned()), read_key(Algorithm::Hs256, hs, false).unwrap().verify)
+    );
+    assert!(
+        !first.add(Some("k1".to_owned()), read_key(Algorithm::EdDsa, ed, false).unwrap().verify)
+    );
     assert_eq!((first.len(), first.is_empty()), (1, false));
 }
 
@@ -382,35 +376,20 @@ fn useless_tokens_are_not_signed() {
     assert!(sign(&Realm::default(), None, &key, &fine).is_ok());
     for bad in [
         NewToken { subject: "", ..fine },
-        NewToken {
-            subject: "a\tb",
-            ..fine
-        },
+        NewToken { subject: "a\tb", ..fine },
         NewToken { roles: &worker, ..fine },
         NewToken { roles: &twice, ..fine },
-        NewToken {
-            roles: &unknown,
-            ..fine
-        },
+        NewToken { roles: &unknown, ..fine },
         NewToken { roles: &none, ..fine },
-        NewToken {
-            layer: Some("A"),
-            ..fine
-        },
-        NewToken {
-            expires_s: NOW_S,
-            ..fine
-        },
+        NewToken { layer: Some("A"), ..fine },
+        NewToken { expires_s: NOW_S, ..fine },
     ] {
         assert!(sign(&Realm::default(), None, &key, &bad).is_err(), "{bad:?}");
     }
-    let bound = NewToken {
-        roles: &worker,
-        layer: Some("edge"),
-        ..fine
-    };
+    let bound = NewToken { roles: &worker, layer: Some("edge"), ..fine };
     assert!(sign(&Realm::default(), None, &key, &bound).is_ok());
-    let error = sign_locally(&Realm::default(), b"short", Algorithm::Hs256, None, &fine).unwrap_err();
+    let error =
+        sign_locally(&Realm::default(), b"short", Algorithm::Hs256, None, &fine).unwrap_err();
     assert!(error.starts_with("the key file holds 5 bytes"), "{error}");
 }
 
@@ -480,7 +459,8 @@ fn rsa_numbers(der: &[u8]) -> (String, String) {
 
 proptest! {
     #[test]
-    fn no_text_breaks_the_check(text in ".{0,200}", parts in "[A-Za-z0-9_-]{0,40}([.][A-Za-z0-9_-]{0,40}){2}") {
+    fn no_text_breaks_the_check(text in ".{0,200}",
+        parts in "[A-Za-z0-9_-]{0,40}([.][A-Za-z0-9_-]{0,40}){2}") {
         let keys = set(&[("k1", Algorithm::Hs256)]);
         prop_assert!(verify(&text, &keys, &Realm::default(), NOW_S).is_err());
         prop_assert!(verify(&parts, &keys, &Realm::default(), NOW_S).is_err());
@@ -488,7 +468,8 @@ proptest! {
     }
 
     #[test]
-    fn no_changed_token_is_accepted(place in 0_usize..10_000, other in any::<u8>(), which in 0_usize..3) {
+    fn no_changed_token_is_accepted(place in 0_usize..10_000, other in any::<u8>(),
+        which in 0_usize..3) {
         let algorithm = Algorithm::ALL[which];
         let keys = set(&[("k1", algorithm)]);
         let token = good(algorithm, Some("k1"));

@@ -7,9 +7,7 @@ use zeroize::Zeroizing;
 
 /// A part of a token, or a number of a JWK.
 pub(crate) fn from_base64url(text: &str) -> Result<Vec<u8>, String> {
-    URL_SAFE_NO_PAD
-        .decode(text)
-        .map_err(|error| format!("is not base64url: {error}"))
+    URL_SAFE_NO_PAD.decode(text).map_err(|error| format!("is not base64url: {error}"))
 }
 
 pub(crate) fn to_base64url(bytes: &[u8]) -> String {
@@ -18,7 +16,8 @@ pub(crate) fn to_base64url(bytes: &[u8]) -> String {
 
 /// JSON without duplicate members: two readers of one token must not see different claims.
 pub(crate) fn strict_json(bytes: &[u8]) -> Result<Value, String> {
-    blaze_domain::config::json::parse(bytes).map_err(|error| format!("is not JSON as it must be: {error}"))
+    blaze_domain::config::json::parse(bytes)
+        .map_err(|error| format!("is not JSON as it must be: {error}"))
 }
 
 /// A part of a token as a JSON object.

@@ -48,9 +48,7 @@ pub fn verify(token: &str, keys: &KeySet, realm: &Realm, now_s: i64) -> Result<C
     if header.contains_key("crit") {
         return Err("the token has crit, and no extension is known here".to_owned().into());
     }
-    let kid = text(&header, "kid")?
-        .map(|kid| bounded("kid", kid, MAX_ID_BYTES))
-        .transpose()?;
+    let kid = text(&header, "kid")?.map(|kid| bounded("kid", kid, MAX_ID_BYTES)).transpose()?;
     let key = keys.find(kid)?;
     if algorithm != key.algorithm().as_str() {
         let (found, wanted) = (shown(algorithm), key.algorithm());
@@ -87,9 +85,7 @@ fn read_claims(claims: &Map<String, Value>, realm: &Realm, now_s: i64) -> Result
     if layer.is_none() && roles.iter().any(|role| role == Role::Worker.as_str()) {
         return Err("a token with role worker needs a layer".to_owned());
     }
-    let token_id = text(claims, "jti")?
-        .map(|id| bounded("jti", id, MAX_ID_BYTES))
-        .transpose()?;
+    let token_id = text(claims, "jti")?.map(|id| bounded("jti", id, MAX_ID_BYTES)).transpose()?;
     Ok(Claims {
         subject: subject.to_owned(),
         roles,
@@ -108,11 +104,7 @@ fn check_audience(claims: &Map<String, Value>, wanted: &str) -> Result<(), Strin
         Some(_) => return Err("aud is neither a string nor an array of strings".to_owned()),
         None => return Err("aud is missing".to_owned()),
     };
-    if fits {
-        Ok(())
-    } else {
-        Err(format!("aud is not {wanted:?}"))
-    }
+    if fits { Ok(()) } else { Err(format!("aud is not {wanted:?}")) }
 }
 
 /// `exp`, `nbf`, `iat` against the clock; gives `exp`.
@@ -139,9 +131,7 @@ fn read_roles(claims: &Map<String, Value>) -> Result<Vec<String>, String> {
     }
     let one = |role: &Value| match role.as_str() {
         Some(role) if role.len() <= MAX_ROLE_BYTES => Ok(role.to_owned()),
-        _ => Err(format!(
-            "roles holds what is no string of at most {MAX_ROLE_BYTES} bytes"
-        )),
+        _ => Err(format!("roles holds what is no string of at most {MAX_ROLE_BYTES} bytes")),
     };
     roles.iter().map(one).collect()
 }
@@ -160,9 +150,7 @@ fn time(members: &Map<String, Value>, name: &str) -> Result<Option<i64>, String>
     let Some(value) = members.get(name) else {
         return Ok(None);
     };
-    let whole = value
-        .as_i64()
-        .or_else(|| value.as_f64().map(|seconds| seconds.floor() as i64));
+    let whole = value.as_i64().or_else(|| value.as_f64().map(|seconds| seconds.floor() as i64));
     whole.map(Some).ok_or_else(|| format!("{name} is no number of seconds"))
 }
 

@@ -26,12 +26,12 @@ fn main() {
     let (all_width, all_height) = (2.0 * WIDTH, HEIGHT + 34.0);
     let _ = writeln!(
         svg,
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {all_width} {all_height}\" font-family=\"sans-serif\" font-size=\"11\">"
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {all_width} {all_height}\" \
+         font-family=\"sans-serif\" font-size=\"11\">"
     );
     let _ = writeln!(svg, "<rect width=\"100%\" height=\"100%\" fill=\"white\"/>");
-    for (at, (sharing, title)) in [(Sharing::Paper, "share: paper"), (Sharing::Fair, "share: fair")]
-        .into_iter()
-        .enumerate()
+    for (at, (sharing, title)) in
+        [(Sharing::Paper, "share: paper"), (Sharing::Fair, "share: fair")].into_iter().enumerate()
     {
         panel(&mut svg, at as f64 * WIDTH, sharing, title);
     }
@@ -40,7 +40,8 @@ fn main() {
         let y = HEIGHT + 20.0;
         let _ = writeln!(
             svg,
-            "<line x1=\"{x}\" y1=\"{y}\" x2=\"{}\" y2=\"{y}\" stroke=\"{colour}\" stroke-width=\"2\"/><text x=\"{}\" y=\"{}\">{name}</text>",
+            "<line x1=\"{x}\" y1=\"{y}\" x2=\"{}\" y2=\"{y}\" stroke=\"{colour}\" \
+             stroke-width=\"2\"/><text x=\"{}\" y=\"{}\">{name}</text>",
             x + 22.0,
             x + 28.0,
             y + 4.0
@@ -53,15 +54,12 @@ fn main() {
 fn panel(svg: &mut String, left: f64, sharing: Sharing, title: &str) {
     let x = |mbps: f64| left + MARGIN + (WIDTH - MARGIN - 12.0) * mbps / MOST_MBPS;
     let y = |hz: f64| HEIGHT - 30.0 - (HEIGHT - 60.0) * hz / MOST_HZ;
-    let _ = writeln!(
-        svg,
-        "<text x=\"{}\" y=\"18\" font-weight=\"bold\">{title}</text>",
-        x(0.0)
-    );
+    let _ = writeln!(svg, "<text x=\"{}\" y=\"18\" font-weight=\"bold\">{title}</text>", x(0.0));
     for hz in [0.0, 10.0, 20.0, 30.0, 40.0, 50.0] {
         let _ = writeln!(
             svg,
-            "<line x1=\"{}\" y1=\"{2}\" x2=\"{1}\" y2=\"{2}\" stroke=\"#ddd\"/><text x=\"{3}\" y=\"{4}\" text-anchor=\"end\">{hz}</text>",
+            "<line x1=\"{}\" y1=\"{2}\" x2=\"{1}\" y2=\"{2}\" stroke=\"#ddd\"/><text x=\"{3}\" \
+             y=\"{4}\" text-anchor=\"end\">{hz}</text>",
             x(0.0),
             x(MOST_MBPS),
             y(hz),
@@ -79,7 +77,8 @@ fn panel(svg: &mut String, left: f64, sharing: Sharing, title: &str) {
     }
     let _ = writeln!(
         svg,
-        "<text x=\"{}\" y=\"{}\" text-anchor=\"end\">limit_mbps</text><text x=\"{}\" y=\"{}\">Hz</text>",
+        "<text x=\"{}\" y=\"{}\" text-anchor=\"end\">limit_mbps</text><text x=\"{}\" \
+         y=\"{}\">Hz</text>",
         x(MOST_MBPS),
         y(0.0) + 28.0,
         x(0.0) - 24.0,
@@ -95,10 +94,7 @@ fn panel(svg: &mut String, left: f64, sharing: Sharing, title: &str) {
             lanes: vec![Lane { max_rate_hz: None }],
         })
         .collect();
-    let terms = Terms {
-        sharing,
-        ..Terms::default()
-    };
+    let terms = Terms { sharing, ..Terms::default() };
     for (at, (_, _, _, colour)) in TOPICS.iter().enumerate() {
         let mut points = String::new();
         for step in 1..=400 {

@@ -4,10 +4,11 @@
 //! cargo run --release --example compression_cost -- [FILE [FRAMES]]
 //! ```
 //!
-//! FILE holds raw frames of 640×480 RGB, 921,600 bytes each, one behind the other; without it, or with `-`, frames are
-//! made up. FRAMES are measured, 8 unless told otherwise, spread over the file. Columns: milliseconds of processor time
-//! to compress a frame (mean and worst) and to decompress it, its size in percent of what it was, and how many frames
-//! of 30 Hz streams a processor can do.
+//! FILE holds raw frames of 640×480 RGB, 921,600 bytes each, one behind the other; without it, or
+//! with `-`, frames are made up. FRAMES are measured, 8 unless told otherwise, spread over the
+//! file. Columns: milliseconds of processor time to compress a frame (mean and worst) and to
+//! decompress it, its size in percent of what it was, and how many frames of 30 Hz streams a
+//! processor can do.
 
 #[path = "../../dataplane/src/codec/lz4/image.rs"]
 mod image;
@@ -27,9 +28,7 @@ fn main() -> anyhow::Result<()> {
     };
     let frames = match &file {
         Some(file) => read(Path::new(file), count.max(1))?,
-        None => (0..count.max(1) as u64)
-            .map(|number| image::frame(number * 7))
-            .collect(),
+        None => (0..count.max(1) as u64).map(|number| image::frame(number * 7)).collect(),
     };
     println!(
         "{} frames of {} bytes, {}; LZ4 {}",
@@ -85,10 +84,5 @@ fn read(file: &Path, count: usize) -> anyhow::Result<Vec<Vec<u8>>> {
         bail!("{} holds no frame of {} bytes", file.display(), image::FRAME_BYTES);
     }
     let step = (all.len() / count).max(1);
-    Ok(all
-        .iter()
-        .step_by(step)
-        .take(count)
-        .map(|frame| frame.to_vec())
-        .collect())
+    Ok(all.iter().step_by(step).take(count).map(|frame| frame.to_vec()).collect())
 }

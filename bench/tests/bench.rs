@@ -1,4 +1,5 @@
-//! The load generator of `blaze-bench config`, at tiny counts: it measures answers that are checked, or fails.
+//! The load generator of `blaze-bench config`, at tiny counts: it measures answers that are
+//! checked, or fails.
 //!
 //! Needs `cargo build --workspace` and `scripts/services install` (etcd, MongoDB).
 
@@ -40,12 +41,8 @@ fn every_load_is_done_by_everybody() {
     for load in ["get, 2 conn", "put, 2 conn", "apply 100, 2 conn", "watch, 5 at 50 Hz"] {
         let of_load: Vec<&Value> = rows.iter().filter(|row| row["load"] == load).collect();
         let names: Vec<&str> = of_load.iter().map(|row| row["subject"].as_str().unwrap()).collect();
-        let blaze = [
-            "blaze grpc mongodb",
-            "blaze grpc sqlite",
-            "blaze rest mongodb",
-            "blaze rest sqlite",
-        ];
+        let blaze =
+            ["blaze grpc mongodb", "blaze grpc sqlite", "blaze rest mongodb", "blaze rest sqlite"];
         let in_turns: Vec<&str> = blaze.into_iter().flat_map(|name| ["etcd", name]).collect();
         assert_eq!(names, in_turns, "{load}");
         for row in of_load {

@@ -1,6 +1,7 @@
 //! The broker port and its adapters.
 //!
-//! [`Broker`] is what BlazeFlow and the SDK know of a message system; [`memory`] serves services and flows of one process.
+//! [`Broker`] is what BlazeFlow and the SDK know of a message system; [`memory`] serves services
+//! and flows of one process.
 
 pub mod dds;
 #[cfg(feature = "kafka")]
@@ -19,7 +20,8 @@ mod worker_side;
 
 pub use open::{OpenError, check_layer, open_layer, open_node};
 pub use port::{
-    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, Place, PublishOutcome,
-    Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,
+    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, Place,
+    PublishOutcome, Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription,
+    SubscriptionSender, subscription,
 };
 pub use worker_side::{Held, KeyedMessage, WorkerSide, WriteError};

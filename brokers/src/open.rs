@@ -11,7 +11,8 @@ use crate::port::{Broker, Role};
 /// Why a broker of the node file cannot be used at all. A server that is merely away is no error.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum OpenError {
-    /// A file that the section names cannot be read or holds no such thing, or a value that the client library refuses.
+    /// A file that the section names cannot be read or holds no such thing, or a value that the
+    /// client library refuses.
     #[error("{key}: {reason}")]
     Setting {
         /// Key below `brokers.node` or `brokers.layer`, such as `redis.password_file`.
@@ -30,8 +31,8 @@ pub enum OpenError {
     InProcess,
 }
 
-/// Whether the section of a layer scope holds together; connects nowhere and reads no files, so that a node file can be
-/// checked on another machine.
+/// Whether the section of a layer scope holds together; connects nowhere and reads no files, so
+/// that a node file can be checked on another machine.
 ///
 /// # Errors
 /// As [`open_layer`], but for adapters that live inside one process.
@@ -64,7 +65,9 @@ pub fn open_node(section: &NodeBroker, role: &Role) -> Result<Arc<dyn Broker>, O
 pub fn open_layer(section: &LayerBroker, role: &Role) -> Result<Arc<dyn Broker>, OpenError> {
     match section {
         LayerBroker::Memory => Err(OpenError::InProcess),
-        LayerBroker::Dds(dds) => Ok(Arc::new(DdsBroker::open(dds).map_err(|error| dds_error(&error))?)),
+        LayerBroker::Dds(dds) => {
+            Ok(Arc::new(DdsBroker::open(dds).map_err(|error| dds_error(&error))?))
+        }
         #[cfg(feature = "kafka")]
         LayerBroker::Kafka(kafka) => Ok(Arc::new(crate::kafka::KafkaBroker::open(kafka, role)?)),
         #[cfg(not(feature = "kafka"))]
@@ -81,8 +84,5 @@ fn dds_error(error: &DdsError) -> OpenError {
         DdsError::Address(_) | DdsError::AddressMissing { .. } => "dds.interface",
         DdsError::Create { .. } | DdsError::Panicked(_) => "dds",
     };
-    OpenError::Setting {
-        key: key.to_owned(),
-        reason: error.to_string(),
-    }
+    OpenError::Setting { key: key.to_owned(), reason: error.to_string() }
 }

@@ -1,4 +1,5 @@
-//! What waits for a server: bounded queues, one per publisher, emptied in turns by the one writer of a connection.
+//! What waits for a server: bounded queues, one per publisher, emptied in turns by the one writer
+//! of a connection.
 //!
 //! ```text
 //! publisher ─► lane (oldest give way) ─┐
@@ -6,7 +7,8 @@
 //! publisher ─► lane                   ─┘        (what is over its deadline is dropped here)
 //! ```
 //!
-//! A message counts as queued from [`Lane::push`] until it is settled, so that nothing is ever uncounted.
+//! A message counts as queued from [`Lane::push`] until it is settled, so that nothing is ever
+//! uncounted.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -99,10 +101,9 @@ pub(crate) struct Waiting<C> {
 impl<C> Waiting<C> {
     /// The frame as it is to be written now: its age has grown by what it waited.
     pub(crate) fn aged(frame: &Frame, since: Instant, now: Instant) -> Frame {
-        let waited = u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX);
-        frame
-            .clone()
-            .with_hops_and_age(frame.hops(), frame.age_us().saturating_add(waited))
+        let waited =
+            u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX);
+        frame.clone().with_hops_and_age(frame.hops(), frame.age_us().saturating_add(waited))
     }
 
     /// Bytes that it holds.
@@ -121,8 +122,8 @@ impl<C> Waiting<C> {
     }
 }
 
-/// The duty to settle a message whose bytes may be with the server's client already. Dropped unsettled it counts as
-/// `broker_error`.
+/// The duty to settle a message whose bytes may be with the server's client already. Dropped
+/// unsettled it counts as `broker_error`.
 #[derive(Debug)]
 pub(crate) struct Receipt(Option<Arc<Counts>>);
 
@@ -255,12 +256,7 @@ impl<C> Outbox<C> {
         };
         state.lanes.insert(id, queue);
         drop(state);
-        Lane {
-            outbox: Arc::clone(self),
-            id,
-            counts,
-            longest_wait,
-        }
+        Lane { outbox: Arc::clone(self), id, counts, longest_wait }
     }
 
     /// Waits until something may be there. Cancelling it loses nothing.
@@ -273,15 +269,22 @@ impl<C> Outbox<C> {
         self.state.lock().bytes == 0
     }
 
-    /// Takes messages in turns of the lanes until `messages` or `bytes` are reached (one message is always taken), and drops
-    /// those whose time is over. Returns the bytes taken.
-    pub(crate) fn take(&self, now: Instant, messages: usize, bytes: usize, into: &mut Vec<Waiting<C>>) -> usize {
+    /// Takes messages in turns of the lanes until `messages` or `bytes` are reached (one message is
+    /// always taken), and drops those whose time is over. Returns the bytes taken.
+    pub(crate) fn take(
+        &self,
+        now: Instant,
+        messages: usize,
+        bytes: usize,
+        into: &mut Vec<Waiting<C>>,
+    ) -> usize {
         self.take_ready(now, messages, bytes, true, |_| Some(usize::MAX), into)
     }
 
-    /// As [`take`](Self::take), only from lanes whose `to` is ready, and of each at most the bytes that `allowance` gives for
-    /// its turn, but always one message; what waits in the others is only dropped when its time is over. With `one_always`,
-    /// one message is taken even if it is larger than `bytes`.
+    /// As [`take`](Self::take), only from lanes whose `to` is ready, and of each at most the bytes
+    /// that `allowance` gives for its turn, but always one message; what waits in the others is
+    /// only dropped when its time is over. With `one_always`, one message is taken even if it is
+    /// larger than `bytes`.
     pub(crate) fn take_ready(
         &self,
         now: Instant,
@@ -334,7 +337,8 @@ impl<C> Outbox<C> {
                 });
             }
             if full {
-                // It keeps its place: one that is too large for what is left is the first of the next take.
+                // It keeps its place: one that is too large for what is left is the first of the
+                // next take.
                 state.turns.push_front(id);
                 break;
             }
@@ -461,7 +465,8 @@ impl<C: Send + Sync, A: Admission> Publisher for LanePublisher<C, A> {
         self.push(Body::Frame(frame.clone()), frame.payload().len(), deadline)
     }
 
-    /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept for late joiners.
+    /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept
+    /// for late joiners.
     fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome {
         self.push(Body::Bare(payload.clone()), payload.len(), deadline)
     }
@@ -488,11 +493,8 @@ impl<C> Drop for Lane<C> {
 mod tests {
     use super::*;
 
-    const SMALL: OutboxLimits = OutboxLimits {
-        lane_messages: 4,
-        lane_bytes: 10_000,
-        total_bytes: 20_000,
-    };
+    const SMALL: OutboxLimits =
+        OutboxLimits { lane_messages: 4, lane_bytes: 10_000, total_bytes: 20_000 };
 
     fn bare(number: u8, bytes: usize) -> Body {
         Body::Bare(Bytes::from(vec![number; bytes]))
@@ -505,7 +507,11 @@ mod tests {
         }
     }
 
-    fn take_all(outbox: &Outbox<&'static str>, messages: usize, bytes: usize) -> Vec<(&'static str, u8)> {
+    fn take_all(
+        outbox: &Outbox<&'static str>,
+        messages: usize,
+        bytes: usize,
+    ) -> Vec<(&'static str, u8)> {
         let mut into = Vec::new();
         outbox.take(Instant::now(), messages, bytes, &mut into);
         let seen = into.iter().map(number).collect();
@@ -529,10 +535,7 @@ mod tests {
 
     #[test]
     fn lanes_take_turns_and_limits_stop_a_take() {
-        let outbox = Outbox::new(OutboxLimits {
-            lane_messages: 100,
-            ..SMALL
-        });
+        let outbox = Outbox::new(OutboxLimits { lane_messages: 100, ..SMALL });
         let (a, b) = (outbox.lane("a", None), outbox.lane("b", None));
         for count in 0..20 {
             a.push(bare(count, 10), None);
@@ -547,10 +550,7 @@ mod tests {
 
     #[test]
     fn a_lane_gives_what_it_is_allowed_and_always_one() {
-        let outbox = Outbox::new(OutboxLimits {
-            lane_messages: 6,
-            ..SMALL
-        });
+        let outbox = Outbox::new(OutboxLimits { lane_messages: 6, ..SMALL });
         let lane = outbox.lane("a", None);
         for count in 0..6 {
             lane.push(bare(count, 10), None);
@@ -636,13 +636,7 @@ mod tests {
         drop(into.pop());
         drop(into.pop().map(Waiting::into_receipt));
         outbox.clear(DropReason::BrokerError);
-        assert_eq!(
-            lane.later(),
-            Later {
-                broker_error: 3,
-                ..Later::default()
-            }
-        );
+        assert_eq!(lane.later(), Later { broker_error: 3, ..Later::default() });
         outbox.close();
         assert_eq!(lane.push(bare(4, 10), None), PublishOutcome::Dropped);
     }

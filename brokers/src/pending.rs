@@ -1,5 +1,5 @@
-//! Values of keys that wait to be written to a server. Of a key only the last value counts, so one that the server did not
-//! take is simply written again.
+//! Values of keys that wait to be written to a server. Of a key only the last value counts, so one
+//! that the server did not take is simply written again.
 
 use std::collections::{HashMap, VecDeque};
 use std::hash::Hash;
@@ -19,17 +19,13 @@ pub(crate) struct Pending<K, V> {
 
 impl<K, V> Default for Pending<K, V> {
     fn default() -> Self {
-        Self {
-            values: HashMap::new(),
-            order: VecDeque::new(),
-            under_way: false,
-            dropped: 0,
-        }
+        Self { values: HashMap::new(), order: VecDeque::new(), under_way: false, dropped: 0 }
     }
 }
 
 impl<K: Hash + Eq + Clone, V> Pending<K, V> {
-    /// Takes a value in; an older one of the key that still waits is forgotten. Returns false where too many wait.
+    /// Takes a value in; an older one of the key that still waits is forgotten. Returns false where
+    /// too many wait.
     pub(crate) fn put(&mut self, key: K, value: V) -> bool {
         if let Some(before) = self.values.get_mut(&key) {
             *before = value;
@@ -52,7 +48,8 @@ impl<K: Hash + Eq + Clone, V> Pending<K, V> {
         self.order.clear();
     }
 
-    /// The oldest values that may be written now, up to a limit. Those of the call before are settled: written, or put back.
+    /// The oldest values that may be written now, up to a limit. Those of the call before are
+    /// settled: written, or put back.
     pub(crate) fn take(&mut self, limit: usize, may_go: impl Fn(&V) -> bool) -> Vec<(K, V)> {
         let mut taken = Vec::new();
         let mut later = VecDeque::new();
@@ -71,8 +68,8 @@ impl<K: Hash + Eq + Clone, V> Pending<K, V> {
         taken
     }
 
-    /// Values that were taken and may not have arrived wait again, unless there are newer ones: behind the others, which
-    /// a value that is never taken must not hold up.
+    /// Values that were taken and may not have arrived wait again, unless there are newer ones:
+    /// behind the others, which a value that is never taken must not hold up.
     pub(crate) fn put_back(&mut self, taken: Vec<(K, V)>) {
         for (key, value) in taken {
             if !self.values.contains_key(&key) {
@@ -98,7 +95,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_last_value_of_a_key_counts_and_what_did_not_arrive_waits_again_unless_it_is_out_of_date() {
+    fn the_last_value_of_a_key_counts_and_what_did_not_arrive_waits_again_unless_it_is_out_of_date()
+    {
         let mut pending = Pending::default();
         for (key, value) in [("absent", 0), ("a", 1), ("b", 1), ("a", 2), ("c", 1)] {
             pending.put(key, value);

@@ -5,8 +5,9 @@
 //! subscribe:  server ──► adapter ──► SubscriptionSender ──► bounded ring ──► Subscription::receive (batches)
 //! ```
 //!
-//! Publishing never waits: an adapter that cannot keep up drops the oldest of its queue and counts it. A subscription is
-//! a ring that drops its oldest when its reader is slow; the reader learns how many it missed.
+//! Publishing never waits: an adapter that cannot keep up drops the oldest of its queue and counts
+//! it. A subscription is a ring that drops its oldest when its reader is slow; the reader learns
+//! how many it missed.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -68,7 +69,8 @@ pub enum Health {
     Up,
     /// It did answer and does not any more.
     Down,
-    /// It answers, but the scope belongs to another flow, which the detail names: nothing is read or written.
+    /// It answers, but the scope belongs to another flow, which the detail names: nothing is read
+    /// or written.
     InUse,
     /// Closed by us; final.
     Closed,
@@ -95,7 +97,8 @@ impl StatusCell {
         Self(watch::Sender::new(BrokerStatus { health, detail, since }))
     }
 
-    /// Tells a change; a closed broker stays closed. Returns whether the health is another one, where anything is.
+    /// Tells a change; a closed broker stays closed. Returns whether the health is another one,
+    /// where anything is.
     pub(crate) fn set(&self, health: Health, detail: &str) -> Option<bool> {
         let mut turned = false;
         let is_changed = self.0.send_if_modified(|status| {
@@ -157,11 +160,13 @@ pub enum BrokerError {
 pub enum Content {
     /// A message with a header.
     Frame(Frame),
-    /// A payload without a header, and the identity that its place on the server gives it, if that is stable.
+    /// A payload without a header, and the identity that its place on the server gives it, if that
+    /// is stable.
     Bare {
         /// The payload as it is.
         payload: Bytes,
-        /// Writer and sequence, where the server has a stable position (Kafka); otherwise the flow numbers it.
+        /// Writer and sequence, where the server has a stable position (Kafka); otherwise the flow
+        /// numbers it.
         identity: Option<(WriterId, u64)>,
     },
     /// It begins with `BLZ1` and is no frame.
@@ -178,10 +183,7 @@ impl Content {
     #[must_use]
     pub fn of(is_reserved: bool, payload: Bytes) -> Self {
         if is_reserved {
-            return Self::Bare {
-                payload,
-                identity: None,
-            };
+            return Self::Bare { payload, identity: None };
         }
         Self::from_bytes(payload)
     }
@@ -190,10 +192,7 @@ impl Content {
     #[must_use]
     pub fn from_bytes(bytes: Bytes) -> Self {
         if !blaze_proto::frame::claims_to_be_a_frame(&bytes) {
-            return Self::Bare {
-                payload: bytes,
-                identity: None,
-            };
+            return Self::Bare { payload: bytes, identity: None };
         }
         let size = bytes.len();
         match Frame::parse(bytes) {
@@ -232,23 +231,13 @@ impl Received {
     /// A message that was published just now, on a server without places.
     #[must_use]
     pub fn live(content: Content, at: Instant) -> Self {
-        Self {
-            content,
-            at,
-            broker_age_us: 0,
-            kept: false,
-            place: None,
-        }
+        Self { content, at, broker_age_us: 0, kept: false, place: None }
     }
 
     /// A message that was retained for late joiners, on a server without places.
     #[must_use]
     pub fn kept(content: Content, at: Instant, broker_age_us: u64) -> Self {
-        Self {
-            broker_age_us,
-            kept: true,
-            ..Self::live(content, at)
-        }
+        Self { broker_age_us, kept: true, ..Self::live(content, at) }
     }
 }
 
@@ -259,7 +248,8 @@ pub struct Place {
     pub partition: usize,
     /// Its offset there; the next message has a larger one.
     pub offset: i64,
-    /// When the server took it, in milliseconds of the server's clock since 1970; `None` where it does not tell.
+    /// When the server took it, in milliseconds of the server's clock since 1970; `None` where it
+    /// does not tell.
     pub appended_ms: Option<i64>,
 }
 
@@ -269,10 +259,11 @@ pub enum Begin {
     /// With what is published from now on.
     #[default]
     Now,
-    /// At these offsets, by partition; further partitions now. An offset that the server does not have is moved to the nearest.
+    /// At these offsets, by partition; further partitions now. An offset that the server does not
+    /// have is moved to the nearest.
     At(Arc<[i64]>),
-    /// With the first message that the server took at that time of its clock (milliseconds since 1970) or later, but never
-    /// behind these offsets, by partition.
+    /// With the first message that the server took at that time of its clock (milliseconds
+    /// since 1970) or later, but never behind these offsets, by partition.
     Since {
         /// The time.
         appended_ms: i64,
@@ -307,12 +298,7 @@ pub struct SubscribeOptions {
 
 impl Default for SubscribeOptions {
     fn default() -> Self {
-        Self {
-            max_messages: 4096,
-            max_bytes: 64 * 1024 * 1024,
-            large: false,
-            with_kept: false,
-        }
+        Self { max_messages: 4096, max_bytes: 64 * 1024 * 1024, large: false, with_kept: false }
     }
 }
 
@@ -363,8 +349,8 @@ impl Later {
 
 /// Writes one channel. Never waits.
 pub trait Publisher: Send + Sync {
-    /// Hands over a message with its header. Hops are written as the frame has them; its age grows by what it waits here.
-    /// One that the server could not be given before `deadline` is dropped.
+    /// Hands over a message with its header. Hops are written as the frame has them; its age grows
+    /// by what it waits here. One that the server could not be given before `deadline` is dropped.
     fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome;
 
     /// Hands over a payload as it is: for reserved channels and bare ones.
@@ -386,17 +372,28 @@ pub trait Broker: Send + Sync + 'static {
     /// A writer for a channel.
     ///
     /// # Errors
-    /// [`BrokerError`] when the channel cannot be written at all; a server that is away is no error.
-    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError>;
+    /// [`BrokerError`] when the channel cannot be written at all; a server that is away is no
+    /// error.
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError>;
 
-    /// Reads a channel from now on; what is published after this call returns is received, in order per writer, also
-    /// after the connection was lost and came back. What was published meanwhile may be missing.
+    /// Reads a channel from now on; what is published after this call returns is received, in order
+    /// per writer, also after the connection was lost and came back. What was published meanwhile
+    /// may be missing.
     ///
     /// # Errors
     /// [`BrokerError`] when it cannot be subscribed now.
-    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError>;
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError>;
 
-    /// As [`Broker::subscribe`], from a place on the server. A server that keeps no messages begins now.
+    /// As [`Broker::subscribe`], from a place on the server. A server that keeps no messages begins
+    /// now.
     ///
     /// # Errors
     /// As [`Broker::subscribe`].
@@ -410,19 +407,20 @@ pub trait Broker: Send + Sync + 'static {
         self.subscribe(channel, options).await
     }
 
-    /// What only the flow of a scope does on its broker; absent where the client is a service's, or where nothing outlives
-    /// the process.
+    /// What only the flow of a scope does on its broker; absent where the client is a service's, or
+    /// where nothing outlives the process.
     fn flow_side(&self) -> Option<Arc<dyn FlowSide>> {
         None
     }
 
-    /// What only a worker of BlazeConfig does on its broker; absent where a channel is there as soon as it is used (Redis,
-    /// memory), and on Kafka where the client is somebody else's.
+    /// What only a worker of BlazeConfig does on its broker; absent where a channel is there as
+    /// soon as it is used (Redis, memory), and on Kafka where the client is somebody else's.
     fn worker_side(&self) -> Option<Arc<dyn WorkerSide>> {
         None
     }
 
-    /// Delivers what was taken, as far as the server takes it within a second, then closes all subscriptions.
+    /// Delivers what was taken, as far as the server takes it within a second, then closes all
+    /// subscriptions.
     async fn close(&self);
 }
 
@@ -438,23 +436,26 @@ pub enum Role {
         /// Its life: larger is newer.
         epoch: u64,
     },
-    /// A worker of BlazeConfig: it makes the channels on which services ask and are told, and disturbs no flow.
+    /// A worker of BlazeConfig: it makes the channels on which services ask and are told, and
+    /// disturbs no flow.
     Worker,
 }
 
-/// What only the flow of a scope does on its broker, beside messages. Nothing here waits but reading leases.
+/// What only the flow of a scope does on its broker, beside messages. Nothing here waits but
+/// reading leases.
 #[async_trait]
 pub trait FlowSide: Send + Sync {
-    /// Makes a channel where channels must be made (Kafka), and makes it again when it vanishes, until it is released.
-    /// `depth` is what the channel keeps per writer for late joiners; 0 = nothing.
+    /// Makes a channel where channels must be made (Kafka), and makes it again when it vanishes,
+    /// until it is released. `depth` is what the channel keeps per writer for late joiners; 0 =
+    /// nothing.
     ///
     /// # Errors
-    /// [`BrokerError::Name`] when the server can have no such channel, [`BrokerError::Collision`] when it does not tell it
-    /// apart from another one that it has.
+    /// [`BrokerError::Name`] when the server can have no such channel, [`BrokerError::Collision`]
+    /// when it does not tell it apart from another one that it has.
     fn prepare(&self, channel: &ChannelName, depth: u32) -> Result<(), BrokerError>;
 
-    /// Channels that were prepared and then turned out to have the name of somebody else's, which is given with each; since
-    /// the last call.
+    /// Channels that were prepared and then turned out to have the name of somebody else's, which
+    /// is given with each; since the last call.
     fn take_collisions(&self) -> Vec<(ChannelName, String)> {
         Vec::new()
     }
@@ -477,7 +478,8 @@ pub trait FlowSide: Send + Sync {
     /// A writer's lease has lapsed: what is kept of it for late joiners goes.
     fn forget_writer(&self, channel: &ChannelName, writer: WriterId);
 
-    /// Another layer's flow was first on this broker (given as text): neither read nor write until told `None`.
+    /// Another layer's flow was first on this broker (given as text): neither read nor write until
+    /// told `None`.
     fn stand_back(&self, for_whom: Option<String>);
 }
 
@@ -497,7 +499,8 @@ struct RingState {
     closed: bool,
 }
 
-/// Room for what is kept for late joiners, beside the bounds of a subscription, until the reader has taken as much.
+/// Room for what is kept for late joiners, beside the bounds of a subscription, until the reader
+/// has taken as much.
 #[derive(Default)]
 struct More {
     messages: usize,
@@ -518,7 +521,9 @@ impl RingState {
         let max_messages = options.max_messages.saturating_add(self.more.messages);
         let max_bytes = options.max_bytes.saturating_add(self.more.bytes);
         let mut lost = 0;
-        while !self.messages.is_empty() && (self.messages.len() >= max_messages || self.bytes + size > max_bytes) {
+        while !self.messages.is_empty()
+            && (self.messages.len() >= max_messages || self.bytes + size > max_bytes)
+        {
             if let Some(oldest) = self.messages.pop_front() {
                 self.bytes -= oldest.content.size();
                 lost += 1;
@@ -555,8 +560,8 @@ pub struct Subscription {
     starts: Vec<i64>,
 }
 
-/// Messages that are kept for late joiners and handed over beyond the bounds of a subscription, at most: as many as a store
-/// holds of the smallest ones.
+/// Messages that are kept for late joiners and handed over beyond the bounds of a subscription, at
+/// most: as many as a store holds of the smallest ones.
 pub const MAX_KEPT_MESSAGES: usize = 262_144;
 /// Their bytes at most (256 MiB), which is what a reader takes of a topic of Kafka.
 pub const MAX_KEPT_BYTES: usize = 256 * 1024 * 1024;
@@ -570,15 +575,7 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
         dropped: AtomicU64::new(0),
         options,
     });
-    (
-        SubscriptionSender {
-            ring: Arc::clone(&ring),
-        },
-        Subscription {
-            ring,
-            starts: Vec::new(),
-        },
-    )
+    (SubscriptionSender { ring: Arc::clone(&ring) }, Subscription { ring, starts: Vec::new() })
 }
 
 impl SubscriptionSender {
@@ -587,9 +584,9 @@ impl SubscriptionSender {
         self.hand_over([message], false)
     }
 
-    /// Hands messages to the reader that were kept for late joiners, at once. They raise the bounds until it has taken as
-    /// many, because it cannot read while they are collected: at most by [`MAX_KEPT_MESSAGES`] and [`MAX_KEPT_BYTES`].
-    /// Returns whether the subscription still lives.
+    /// Hands messages to the reader that were kept for late joiners, at once. They raise the bounds
+    /// until it has taken as many, because it cannot read while they are collected: at most by
+    /// [`MAX_KEPT_MESSAGES`] and [`MAX_KEPT_BYTES`]. Returns whether the subscription still lives.
     pub fn send_kept(&self, kept: impl IntoIterator<Item = Received>) -> bool {
         self.hand_over(kept, true)
     }
@@ -613,7 +610,8 @@ impl SubscriptionSender {
         true
     }
 
-    /// Counts messages that the reader will never get because it, or whoever reads for it, was too slow.
+    /// Counts messages that the reader will never get because it, or whoever reads for it, was too
+    /// slow.
     pub fn note_lost(&self, messages: u64) {
         if messages > 0 {
             self.ring.dropped.fetch_add(messages, Ordering::Relaxed);
@@ -641,15 +639,16 @@ impl Subscription {
         self
     }
 
-    /// Offset of the first message that it can get, by partition; empty where the server has no places. What is kept for late
-    /// joiners may lie before; partitions that the topic gets later are read from their beginning.
+    /// Offset of the first message that it can get, by partition; empty where the server has no
+    /// places. What is kept for late joiners may lie before; partitions that the topic gets later
+    /// are read from their beginning.
     #[must_use]
     pub fn starts(&self) -> &[i64] {
         &self.starts
     }
 
-    /// Waits for messages and takes up to `limit` of them into `batch`. Returns how many; 0 = the subscription ended.
-    /// Cancelling it loses nothing.
+    /// Waits for messages and takes up to `limit` of them into `batch`. Returns how many; 0 = the
+    /// subscription ended. Cancelling it loses nothing.
     pub async fn receive(&mut self, batch: &mut Vec<Received>, limit: usize) -> usize {
         loop {
             {
@@ -666,7 +665,8 @@ impl Subscription {
         }
     }
 
-    /// Messages dropped because this reader, or whoever reads for it, was slow, since the last call.
+    /// Messages dropped because this reader, or whoever reads for it, was slow, since the last
+    /// call.
     #[must_use]
     pub fn take_dropped(&self) -> u64 {
         self.ring.dropped.swap(0, Ordering::Relaxed)
@@ -692,21 +692,11 @@ mod tests {
 
     fn message(number: usize) -> Received {
         let payload = Bytes::from(vec![u8::try_from(number % 256).unwrap(); SIZE]);
-        Received::live(
-            Content::Bare {
-                payload,
-                identity: None,
-            },
-            Instant::now(),
-        )
+        Received::live(Content::Bare { payload, identity: None }, Instant::now())
     }
 
     fn bounded(max_messages: usize, max_bytes: usize) -> (SubscriptionSender, Subscription) {
-        subscription(SubscribeOptions {
-            max_messages,
-            max_bytes,
-            ..SubscribeOptions::default()
-        })
+        subscription(SubscribeOptions { max_messages, max_bytes, ..SubscribeOptions::default() })
     }
 
     /// The first bytes of what waits, up to a limit.

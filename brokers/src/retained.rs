@@ -1,5 +1,5 @@
-//! The retained cache: the last messages of each transient_local writer, for those who come later. A hub, a client of
-//! Redis and the lanes of a flow each have one.
+//! The retained cache: the last messages of each transient_local writer, for those who come later.
+//! A hub, a client of Redis and the lanes of a flow each have one.
 
 use std::collections::VecDeque;
 use std::hash::Hash;
@@ -11,7 +11,8 @@ use lru::LruCache;
 pub struct RetainedBounds {
     /// Most writers; the one that was silent longest gives way with all its messages.
     pub writers: usize,
-    /// Most bytes of all writers; whole writers give way, since shortening many would leave all of them incomplete.
+    /// Most bytes of all writers; whole writers give way, since shortening many would leave all of
+    /// them incomplete.
     pub bytes: usize,
     /// Most bytes of one writer; its oldest messages give way.
     pub bytes_of_writer: usize,
@@ -53,31 +54,29 @@ impl<K: Hash + Eq + Clone, M> RetainedCache<K, M> {
     /// An empty cache.
     #[must_use]
     pub fn new(bounds: RetainedBounds) -> Self {
-        Self {
-            writers: LruCache::unbounded(),
-            bounds,
-            bytes: 0,
-            evicted: 0,
-        }
+        Self { writers: LruCache::unbounded(), bounds, bytes: 0, evicted: 0 }
     }
 
     /// Takes a message in as the newest of its writer, of whom the last `depth` stay.
     pub fn keep(&mut self, writer: K, message: M, size: usize, depth: usize) {
-        let retained = self.writers.get_or_insert_mut(writer, || Retained {
-            messages: VecDeque::new(),
-            bytes: 0,
-        });
+        let retained = self
+            .writers
+            .get_or_insert_mut(writer, || Retained { messages: VecDeque::new(), bytes: 0 });
         let before = retained.bytes;
         retained.bytes += size;
         retained.messages.push_back((message, size));
         let most = self.bounds.bytes.min(self.bounds.bytes_of_writer);
-        while retained.messages.len() > 1 && (retained.messages.len() > depth || retained.bytes > most) {
+        while retained.messages.len() > 1
+            && (retained.messages.len() > depth || retained.bytes > most)
+        {
             self.evicted += u64::from(retained.messages.len() <= depth);
             retained.pop();
         }
         self.bytes = self.bytes - before + retained.bytes;
         // This writer was used last, so it goes only when it is alone.
-        while self.writers.len() > self.bounds.writers || (self.bytes > self.bounds.bytes && self.writers.len() > 1) {
+        while self.writers.len() > self.bounds.writers
+            || (self.bytes > self.bounds.bytes && self.writers.len() > 1)
+        {
             let Some((_, oldest)) = self.writers.pop_lru() else {
                 break;
             };
@@ -86,7 +85,8 @@ impl<K: Hash + Eq + Clone, M> RetainedCache<K, M> {
         }
     }
 
-    /// Messages that gave way to a bound of the cache; those beyond the depth of their writer do not count.
+    /// Messages that gave way to a bound of the cache; those beyond the depth of their writer do
+    /// not count.
     #[must_use]
     pub fn evicted(&self) -> u64 {
         self.evicted
@@ -125,11 +125,7 @@ mod tests {
     use super::*;
 
     fn cache(writers: usize, bytes: usize, bytes_of_writer: usize) -> RetainedCache<u8, u64> {
-        RetainedCache::new(RetainedBounds {
-            writers,
-            bytes,
-            bytes_of_writer,
-        })
+        RetainedCache::new(RetainedBounds { writers, bytes, bytes_of_writer })
     }
 
     fn found(cache: &RetainedCache<u8, u64>) -> Vec<(u8, Vec<u64>)> {
@@ -138,10 +134,7 @@ mod tests {
             .map(|(writer, _, retained)| (*writer, retained.iter().copied().collect()))
             .collect();
         found.sort_unstable();
-        assert_eq!(
-            cache.bytes,
-            cache.iter().map(|(.., retained)| retained.bytes()).sum::<usize>()
-        );
+        assert_eq!(cache.bytes, cache.iter().map(|(.., retained)| retained.bytes()).sum::<usize>());
         found
     }
 

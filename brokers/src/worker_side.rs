@@ -1,5 +1,6 @@
-//! What only a worker of BlazeConfig does on its broker, beside messages: channels that must be there before somebody listens
-//! on them, and values that the broker keeps for those who come later.
+//! What only a worker of BlazeConfig does on its broker, beside messages: channels that must be
+//! there before somebody listens on them, and values that the broker keeps for those who come
+//! later.
 
 use std::collections::BTreeSet;
 
@@ -23,11 +24,12 @@ pub struct KeyedMessage {
 /// Why messages were not written, or nobody knows whether they were.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum WriteError {
-    /// As everywhere: [`BrokerError::Name`] also for a channel that was not prepared or that the server does not make.
+    /// As everywhere: [`BrokerError::Name`] also for a channel that was not prepared or that the
+    /// server does not make.
     #[error(transparent)]
     Broker(#[from] BrokerError),
-    /// Channels are still being made, or the server cannot make them just now. Nothing was written; what is for others need not
-    /// wait for them.
+    /// Channels are still being made, or the server cannot make them just now. Nothing was written;
+    /// what is for others need not wait for them.
     #[error("{} channels are not there yet: {reason}", channels.len())]
     NotYet {
         /// All of them.
@@ -57,19 +59,20 @@ pub struct Held {
 /// What only a worker does on a broker where channels are set up beforehand.
 #[async_trait]
 pub trait WorkerSide: Send + Sync {
-    /// Makes a channel that keeps values, and makes it again when it vanishes, until it is released. Does not wait for it.
+    /// Makes a channel that keeps values, and makes it again when it vanishes, until it is
+    /// released. Does not wait for it.
     ///
     /// # Errors
-    /// [`BrokerError::Name`] and [`BrokerError::Collision`] where the server can have no such channel,
-    /// [`BrokerError::TooManyChannels`].
+    /// [`BrokerError::Name`] and [`BrokerError::Collision`] where the server can have no such
+    /// channel, [`BrokerError::TooManyChannels`].
     fn prepare(&self, channel: &ChannelName) -> Result<(), BrokerError>;
 
     /// Nothing is said on the channel any more: it stays as it is.
     fn release(&self, channel: &ChannelName);
 
-    /// Writes messages of prepared channels in their order, and waits until the server has them (Kafka: acknowledged by all
-    /// replicas that are in sync), or the network's client has taken them (DDS). What is taken away of a channel that is not
-    /// prepared is left alone.
+    /// Writes messages of prepared channels in their order, and waits until the server has them
+    /// (Kafka: acknowledged by all replicas that are in sync), or the network's client has taken
+    /// them (DDS). What is taken away of a channel that is not prepared is left alone.
     ///
     /// # Errors
     /// [`WriteError`]: some of them may have been written; writing all of them again does no harm.

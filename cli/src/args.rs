@@ -55,7 +55,8 @@ pub enum Command {
     Hz(HzOptions),
     /// Robot, fog and cloud in one process, with recorded data
     Demo(DemoOptions),
-    /// Main service, worker, flow and broker of one node in one process, for developing services: loopback, no tokens
+    /// Main service, worker, flow and broker of one node in one process, for developing services:
+    /// loopback, no tokens
     Dev(Box<DevOptions>),
     /// Commands of the configuration.
     #[command(flatten)]
@@ -127,10 +128,7 @@ impl fmt::Display for FlowAddress {
 
 impl From<std::net::SocketAddr> for FlowAddress {
     fn from(address: std::net::SocketAddr) -> Self {
-        Self {
-            host: address.ip().to_string(),
-            port: address.port(),
-        }
+        Self { host: address.ip().to_string(), port: address.port() }
     }
 }
 
@@ -143,18 +141,18 @@ impl FromStr for FlowAddress {
             .ok_or_else(|| format!("it needs a port; did you mean {bare}:9101?"))?;
         let host = match host.strip_prefix('[') {
             Some(rest) => rest.strip_suffix(']').ok_or("the bracket is not closed")?,
-            None if host.contains(':') => return Err(format!("an IPv6 address stands in brackets: [{bare}]:9101")),
+            None if host.contains(':') => {
+                return Err(format!("an IPv6 address stands in brackets: [{bare}]:9101"));
+            }
             None => host,
         };
-        let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | ':' | '_' | '%');
+        let allowed =
+            |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | ':' | '_' | '%');
         if host.is_empty() || !host.chars().all(allowed) {
             return Err(format!("{host:?} is no host"));
         }
         match port.parse() {
-            Ok(port) if port > 0 => Ok(Self {
-                host: host.to_owned(),
-                port,
-            }),
+            Ok(port) if port > 0 => Ok(Self { host: host.to_owned(), port }),
             _ => Err(format!("{port:?} is no port: 1 to 65535")),
         }
     }
@@ -169,12 +167,9 @@ impl FromStr for Destination {
     fn from_str(text: &str) -> Result<Self, String> {
         let mut parts = text.split('/');
         let layer = parts.next().unwrap_or_default();
-        layer
-            .parse::<LayerName>()
-            .map_err(|error| format!("layer {layer:?} {error}"))?;
+        layer.parse::<LayerName>().map_err(|error| format!("layer {layer:?} {error}"))?;
         if let Some(node) = parts.next() {
-            node.parse::<NodeName>()
-                .map_err(|error| format!("node {node:?} {error}"))?;
+            node.parse::<NodeName>().map_err(|error| format!("node {node:?} {error}"))?;
         }
         if let Some(service) = parts.next() {
             service

@@ -1,5 +1,5 @@
-//! The programs of BlazeConfig within this process: a main service without tokens, workers on the brokers of its nodes, and flows
-//! that follow what it says.
+//! The programs of BlazeConfig within this process: a main service without tokens, workers on the
+//! brokers of its nodes, and flows that follow what it says.
 //!
 //! ```text
 //! node file ─► main service: REST, gRPC on loopback ◄── worker (one per node) ─► its broker ─► services
@@ -38,17 +38,14 @@ const LOOK: Duration = Duration::from_millis(10);
 /// Starts a main service that asks for no tokens, and waits until it serves.
 ///
 /// # Errors
-/// [`CliError::Usage`] for what `blaze-config --dev` refuses, [`CliError::Failed`] for a port or a store that cannot be used.
+/// [`CliError::Usage`] for what `blaze-config --dev` refuses, [`CliError::Failed`] for a port or a
+/// store that cannot be used.
 pub(crate) async fn start_main(
     section: ControlPlaneSection,
     in_memory: bool,
     supervisor: &Supervisor,
 ) -> Result<(RunningMain, Addresses), CliError> {
-    let setup = Setup {
-        section,
-        dev: true,
-        in_memory,
-    };
+    let setup = Setup { section, dev: true, in_memory };
     setup.check().map_err(|faults| CliError::Usage(faults.join("\n  ")))?;
     let main = RunningMain::start(supervisor, setup)
         .await
@@ -62,8 +59,8 @@ pub(crate) async fn start_main(
     Ok((main, addresses))
 }
 
-/// Makes a flow a service that follows BlazeConfig over its node file, as the program `blaze-flow` is. `cache` is where its sign
-/// of life goes; `judged` hears what became of what BlazeConfig says.
+/// Makes a flow a service that follows BlazeConfig over its node file, as the program `blaze-flow`
+/// is. `cache` is where its sign of life goes; `judged` hears what became of what BlazeConfig says.
 ///
 /// # Errors
 /// [`CliError::Usage`]: a node file that is none for a flow, or an instance that the environment names and that can be none.
@@ -76,7 +73,9 @@ pub(crate) async fn follow(
     judged: impl FnMut(&Verdict) + Send + 'static,
 ) -> Result<FlowService, CliError> {
     let id = flow.id();
-    let refused = |error: String| CliError::Usage(format!("the flow {id} cannot follow BlazeConfig: {error}"));
+    let refused = |error: String| {
+        CliError::Usage(format!("the flow {id} cannot follow BlazeConfig: {error}"))
+    };
     let followed = Followed::of_tree(&format!("node file of {id}"), node_file, log);
     let followed = followed.map_err(|faults| refused(lines(&faults)))?;
     let service = FlowService::follow(flow, followed, cache.cloned(), supervisor, judged).await;
@@ -89,7 +88,8 @@ pub(crate) async fn follow(
 /// # Errors
 /// [`CliError::Usage`]: what the environment says can be none.
 pub(crate) fn instance() -> Result<InstanceName, CliError> {
-    let named = environment::parsed("BLAZE_INSTANCE").map_err(|fault| CliError::Usage(fault.to_string()))?;
+    let named = environment::parsed("BLAZE_INSTANCE")
+        .map_err(|fault| CliError::Usage(fault.to_string()))?;
     Ok(named.unwrap_or_else(InstanceName::first))
 }
 
@@ -102,8 +102,8 @@ pub(crate) struct Worker {
 }
 
 impl Worker {
-    /// Starts the worker of a node on a broker of it. Its copies are kept in `folder`, if there is one; it is asked on the admin port
-    /// of the node file, if `is_asked`.
+    /// Starts the worker of a node on a broker of it. Its copies are kept in `folder`, if there is
+    /// one; it is asked on the admin port of the node file, if `is_asked`.
     ///
     /// # Errors
     /// [`CliError::Failed`]: a port or a folder that cannot be used.
@@ -114,8 +114,10 @@ impl Worker {
         is_asked: bool,
         supervisor: &Supervisor,
     ) -> Result<Self, CliError> {
-        let failed = |error: String| CliError::Failed(format!("the worker does not start: {error}"));
-        let settings = WorkerSettings::of(file).map_err(|faults| CliError::Invalid(lines(&faults)))?;
+        let failed =
+            |error: String| CliError::Failed(format!("the worker does not start: {error}"));
+        let settings =
+            WorkerSettings::of(file).map_err(|faults| CliError::Invalid(lines(&faults)))?;
         let keys = settings.keys.as_ref().map(RedisKeys::open).transpose();
         let keys = keys.map_err(|error| failed(error.to_string()))?.map(Arc::new);
         let (shown, readiness) = (Shown::default(), Readiness::new());
@@ -141,11 +143,7 @@ impl Worker {
         let running = RunningWorker::start(options, supervisor).await;
         let running = Arc::new(running.map_err(|error| failed(format!("{error:#}")))?);
         shown.set(Arc::clone(&running));
-        Ok(Self {
-            running,
-            admin,
-            readiness,
-        })
+        Ok(Self { running, admin, readiness })
     }
 
     /// Waits until it serves what the main service has at a revision.
@@ -156,10 +154,7 @@ impl Worker {
         let start = Instant::now();
         loop {
             let status = self.running.status().await;
-            if status
-                .as_ref()
-                .is_some_and(|status| status.in_sync && status.revision >= revision)
-            {
+            if status.as_ref().is_some_and(|status| status.in_sync && status.revision >= revision) {
                 return Ok(());
             }
             if start.elapsed() > limit {

@@ -28,10 +28,7 @@ impl Ends {
     /// # Errors
     /// [`CliError::Failed`] when the system gives no signal handlers.
     pub(crate) fn new(supervisor: Supervisor) -> Result<Self, CliError> {
-        Ok(Self {
-            signals: Mutex::new(signals()?),
-            supervisor,
-        })
+        Ok(Self { signals: Mutex::new(signals()?), supervisor })
     }
 
     /// Waits for the end; a sentence if it was no signal.

@@ -68,7 +68,8 @@ pub enum CliError {
     Usage(String),
     /// Nobody answers at the address.
     #[error(
-        "no flow answers at {address}: {reason}\n  A flow names its admin port in its line `ready admin=HOST:PORT`; give it with --flow HOST:PORT."
+        "no flow answers at {address}: {reason}\n  A flow names its admin port in its line `ready \
+         admin=HOST:PORT`; give it with --flow HOST:PORT."
     )]
     CannotConnect {
         /// Where it was tried.
@@ -90,7 +91,8 @@ pub enum CliError {
     #[error("{0}")]
     Invalid(String),
     /// The server refused.
-    #[error("{address} answered {status}{}", if detail.is_empty() { String::new() } else { format!(": {detail}") })]
+    #[error("{address} answered {status}{}",
+        if detail.is_empty() { String::new() } else { format!(": {detail}") })]
     Refused {
         /// Who refused.
         address: String,
@@ -130,7 +132,9 @@ pub enum CliError {
     },
     /// A change was sent and no answer came.
     #[error(
-        "{server} took the change and did not answer ({reason}): whether it took effect is not known.\n  Look before you try again: `blaze get` shows what is, `blaze history` who changed it last."
+        "{server} took the change and did not answer ({reason}): whether it took effect is not \
+         known.\n  Look before you try again: `blaze get` shows what is, `blaze history` who \
+         changed it last."
     )]
     OutcomeUnknown {
         /// To whom it was sent.
@@ -160,7 +164,9 @@ impl CliError {
     #[must_use]
     pub fn hinted(self, code: &str, hint: &str) -> Self {
         match self {
-            Self::Problem(refusal) if refusal.code() == code => Self::Problem(Box::new(refusal.with_hint(hint))),
+            Self::Problem(refusal) if refusal.code() == code => {
+                Self::Problem(Box::new(refusal.with_hint(hint)))
+            }
             other => other,
         }
     }
@@ -181,11 +187,15 @@ impl CliError {
             },
             Self::Advised(inner, _) => inner.exit(),
             Self::OutputClosed => Exit::Done,
-            Self::Failed(_) | Self::Answer { .. } | Self::Foreign { .. } | Self::OutcomeUnknown { .. } => Exit::Failed,
+            Self::Failed(_)
+            | Self::Answer { .. }
+            | Self::Foreign { .. }
+            | Self::OutcomeUnknown { .. } => Exit::Failed,
         }
     }
 
-    /// What `-o json` prints on stderr: the problem as the server told it, else one of the same form.
+    /// What `-o json` prints on stderr: the problem as the server told it, else one of the same
+    /// form.
     #[must_use]
     pub fn to_json(&self) -> Value {
         let (code, title) = match self {
@@ -204,8 +214,12 @@ impl CliError {
             }
             Self::Invalid(_) => ("invalid", "What was given is invalid."),
             Self::Refused { .. } => ("refused", "The server refused."),
-            Self::Answer { .. } | Self::Foreign { .. } => ("foreign_answer", "Something else answers there."),
-            Self::OutcomeUnknown { .. } => ("outcome_unknown", "Whether the change took effect is not known."),
+            Self::Answer { .. } | Self::Foreign { .. } => {
+                ("foreign_answer", "Something else answers there.")
+            }
+            Self::OutcomeUnknown { .. } => {
+                ("outcome_unknown", "Whether the change took effect is not known.")
+            }
             Self::Failed(_) | Self::OutputClosed => ("failed", "It was tried and failed."),
         };
         let applied = match self {
@@ -213,7 +227,8 @@ impl CliError {
             _ => "no",
         };
         json!({
-            "type": "about:blank", "title": title, "detail": self.to_string(), "code": code, "applied": applied,
+            "type": "about:blank", "title": title, "detail": self.to_string(), "code": code,
+            "applied": applied,
         })
     }
 }
@@ -255,12 +270,7 @@ mod tests {
         let problem = lost.to_json();
         assert_eq!(problem["code"], "outcome_unknown");
         assert_eq!(problem["applied"], "unknown");
-        assert!(
-            problem["detail"]
-                .as_str()
-                .unwrap()
-                .contains("Look before you try again")
-        );
+        assert!(problem["detail"].as_str().unwrap().contains("Look before you try again"));
         assert_eq!(CliError::Usage("x".to_owned()).to_json()["applied"], "no");
     }
 
@@ -269,10 +279,7 @@ mod tests {
         let error = CliError::Usage("x".to_owned()).advised("Try y.");
         assert_eq!((error.exit(), error.to_string().as_str()), (Exit::Usage, "x\n  Try y."));
         let problem = error.to_json();
-        assert_eq!(
-            (&problem["code"], &problem["hint"]),
-            (&json!("usage"), &json!("Try y."))
-        );
+        assert_eq!((&problem["code"], &problem["hint"]), (&json!("usage"), &json!("Try y.")));
         assert_eq!(problem["detail"], "x");
     }
 }

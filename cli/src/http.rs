@@ -24,20 +24,15 @@ pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Gets one JSON object. `path` begins with a slash and may have a query; it is sent as it is.
 ///
 /// # Errors
-/// [`CliError::CannotConnect`], [`CliError::Refused`] for any status but 200, [`CliError::Answer`] for what is no JSON
-/// object or too large.
+/// [`CliError::CannotConnect`], [`CliError::Refused`] for any status but 200, [`CliError::Answer`]
+/// for what is no JSON object or too large.
 pub async fn get_json(address: &FlowAddress, path: &str) -> Result<Value, CliError> {
-    let cannot = |reason: String| CliError::CannotConnect {
-        address: address.to_string(),
-        reason,
-    };
-    let stream = timeout(
-        CONNECT_TIMEOUT,
-        TcpStream::connect((address.host.as_str(), address.port)),
-    )
-    .await
-    .map_err(|_| cannot(format!("no connection within {} s", CONNECT_TIMEOUT.as_secs())))?
-    .map_err(|error| cannot(error.to_string()))?;
+    let cannot = |reason: String| CliError::CannotConnect { address: address.to_string(), reason };
+    let stream =
+        timeout(CONNECT_TIMEOUT, TcpStream::connect((address.host.as_str(), address.port)))
+            .await
+            .map_err(|_| cannot(format!("no connection within {} s", CONNECT_TIMEOUT.as_secs())))?
+            .map_err(|error| cannot(error.to_string()))?;
     let (status, body) = timeout(ANSWER_TIMEOUT, exchange(stream, address, path))
         .await
         .map_err(|_| cannot(format!("no answer within {} s", ANSWER_TIMEOUT.as_secs())))??;
@@ -48,11 +43,9 @@ pub async fn get_json(address: &FlowAddress, path: &str) -> Result<Value, CliErr
             detail: detail_of(&body),
         });
     }
-    let unexpected = |reason: String| CliError::Answer {
-        address: address.to_string(),
-        reason,
-    };
-    let value: Value = serde_json::from_slice(&body).map_err(|error| unexpected(format!("no JSON: {error}")))?;
+    let unexpected = |reason: String| CliError::Answer { address: address.to_string(), reason };
+    let value: Value =
+        serde_json::from_slice(&body).map_err(|error| unexpected(format!("no JSON: {error}")))?;
     if value.is_object() {
         Ok(value)
     } else {
@@ -60,11 +53,12 @@ pub async fn get_json(address: &FlowAddress, path: &str) -> Result<Value, CliErr
     }
 }
 
-async fn exchange(stream: TcpStream, address: &FlowAddress, path: &str) -> Result<(u16, Bytes), CliError> {
-    let unexpected = |reason: String| CliError::Answer {
-        address: address.to_string(),
-        reason,
-    };
+async fn exchange(
+    stream: TcpStream,
+    address: &FlowAddress,
+    path: &str,
+) -> Result<(u16, Bytes), CliError> {
+    let unexpected = |reason: String| CliError::Answer { address: address.to_string(), reason };
     let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
         .await
         .map_err(|error| unexpected(error.to_string()))?;
@@ -74,10 +68,8 @@ async fn exchange(stream: TcpStream, address: &FlowAddress, path: &str) -> Resul
         .body(Empty::<Bytes>::new())
         .map_err(|error| CliError::Failed(format!("the request cannot be made: {error}")))?;
     let answer = async {
-        let response = sender
-            .send_request(request)
-            .await
-            .map_err(|error| unexpected(error.to_string()))?;
+        let response =
+            sender.send_request(request).await.map_err(|error| unexpected(error.to_string()))?;
         let status = response.status().as_u16();
         let body = Limited::new(response.into_body(), MAX_ANSWER_BYTES)
             .collect()
@@ -86,7 +78,8 @@ async fn exchange(stream: TcpStream, address: &FlowAddress, path: &str) -> Resul
         Ok((status, body.to_bytes()))
     };
     tokio::pin!(answer, connection);
-    // The connection is driven here and not in a task of its own; when it ends first, the answer is already buffered.
+    // The connection is driven here and not in a task of its own; when it ends first, the answer is
+    // already buffered.
     tokio::select! {
         answer = &mut answer => answer,
         _ = &mut connection => answer.await,
@@ -96,9 +89,7 @@ async fn exchange(stream: TcpStream, address: &FlowAddress, path: &str) -> Resul
 /// The server's own words: `{"error":{"detail":…}}`, else the beginning of its text.
 fn detail_of(body: &[u8]) -> String {
     let parsed: Option<Value> = serde_json::from_slice(body).ok();
-    let detail = parsed
-        .as_ref()
-        .and_then(|value| value.pointer("/error/detail")?.as_str());
+    let detail = parsed.as_ref().and_then(|value| value.pointer("/error/detail")?.as_str());
     match detail {
         Some(detail) => detail.to_owned(),
         None => String::from_utf8_lossy(body).trim().chars().take(200).collect(),

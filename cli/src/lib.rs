@@ -32,15 +32,19 @@ use args::Command;
 use exit::{CliError, Exit};
 use output::Output;
 
-/// Runs one command and returns what the process exits with. A failure is told on stderr: in one sentence, with what to do
-/// below it, or, with `-o json` in a command of the configuration, as a problem object on one line.
+/// Runs one command and returns what the process exits with. A failure is told on stderr: in one
+/// sentence, with what to do below it, or, with `-o json` in a command of the configuration, as a
+/// problem object on one line.
 #[must_use]
 pub fn run(arguments: Arguments) -> ExitCode {
-    let as_problem = arguments.output == Output::Json && matches!(arguments.command, Command::Config(_));
+    let as_problem =
+        arguments.output == Output::Json && matches!(arguments.command, Command::Config(_));
     let outcome = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
-        .map_err(|error| CliError::Failed(format!("the asynchronous runtime does not start: {error}")))
+        .map_err(|error| {
+            CliError::Failed(format!("the asynchronous runtime does not start: {error}"))
+        })
         .and_then(|runtime| runtime.block_on(dispatch(arguments)));
     match outcome {
         Ok(exit) => exit.into(),

@@ -33,7 +33,8 @@ impl Output {
             Self::Json => Ok(Format::Json),
             Self::Yaml => Ok(Format::Yaml),
             Self::Wide | Self::Name => Err(CliError::Usage(
-                "-o wide and -o name are for `blaze get`; here there are table, json and yaml".to_owned(),
+                "-o wide and -o name are for `blaze get`; here there are table, json and yaml"
+                    .to_owned(),
             )),
         }
     }
@@ -68,7 +69,8 @@ pub fn terminal_width() -> Option<u16> {
 /// A column: its heading, where its content stands, and what it shows of an item.
 pub type Column<'a, T> = (&'a str, Align, &'a dyn Fn(&T) -> String);
 
-/// Lays out items under headings; wraps cells so that lines fit `width`, and does not wrap without one.
+/// Lays out items under headings; wraps cells so that lines fit `width`, and does not wrap without
+/// one.
 #[must_use]
 pub fn table<T>(items: &[T], width: Option<u16>, columns: &[Column<'_, T>]) -> String {
     let mut table = Table::new();
@@ -100,7 +102,8 @@ pub fn table<T>(items: &[T], width: Option<u16>, columns: &[Column<'_, T>]) -> S
 /// Writes a text to standard output, with a newline at its end.
 ///
 /// # Errors
-/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk and the like.
+/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk
+/// and the like.
 pub fn print(text: &str) -> Result<(), CliError> {
     let newline = if text.ends_with('\n') { "" } else { "\n" };
     write_text(&mut std::io::stdout().lock(), &format!("{text}{newline}"))
@@ -109,7 +112,8 @@ pub fn print(text: &str) -> Result<(), CliError> {
 /// Writes a text as it is.
 ///
 /// # Errors
-/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk and the like.
+/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk
+/// and the like.
 pub(crate) fn write_text(to: &mut impl Write, text: &str) -> Result<(), CliError> {
     let written = to.write_all(text.as_bytes()).and_then(|()| to.flush());
     written.map_err(|error| match error.kind() {
@@ -129,8 +133,12 @@ pub fn format_object(
 ) -> Result<String, CliError> {
     match format {
         Format::Table => table(value),
-        Format::Json => serde_json::to_string_pretty(value).map_err(|error| CliError::Failed(error.to_string())),
-        Format::Yaml => yaml_serde::to_string(value).map_err(|error| CliError::Failed(error.to_string())),
+        Format::Json => {
+            serde_json::to_string_pretty(value).map_err(|error| CliError::Failed(error.to_string()))
+        }
+        Format::Yaml => {
+            yaml_serde::to_string(value).map_err(|error| CliError::Failed(error.to_string()))
+        }
     }
 }
 
@@ -180,11 +188,8 @@ mod tests {
             table(&[("imu/data", "50.0"), ("x", "1.0")], None, &COLUMNS),
             "TOPIC       HZ\nimu/data  50.0\nx          1.0\n"
         );
-        let text = table(
-            &[("a/rather/long/topic name/with many/parts", "50.0")],
-            Some(24),
-            &COLUMNS,
-        );
+        let text =
+            table(&[("a/rather/long/topic name/with many/parts", "50.0")], Some(24), &COLUMNS);
         assert!(text.lines().count() > 2, "{text}");
         assert!(text.lines().all(|line| line.chars().count() <= 24), "{text}");
     }

@@ -1,4 +1,5 @@
-//! `blaze plan`: the rate that each topic would get at each destination, worked out as a running flow works it out.
+//! `blaze plan`: the rate that each topic would get at each destination, worked out as a running
+//! flow works it out.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -23,7 +24,8 @@ pub struct PlanOptions {
     /// Flows and their topics (YAML)
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
-    /// What the wire carries per byte of s·α, as `wire_factor` of /v1/allocation shows it; 1 leaves it out
+    /// What the wire carries per byte of s·α, as `wire_factor` of /v1/allocation shows it; 1 leaves
+    /// it out
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = parse_factor)]
     pub wire_factor: f64,
 }
@@ -45,8 +47,9 @@ pub fn run(options: &PlanOptions, format: Format) -> Result<Exit, CliError> {
     let mut planned = Vec::with_capacity(plan.flows.len());
     let mut seen = BTreeMap::new();
     for (at, flow) in plan.flows.iter().enumerate() {
-        let planned_flow = Planned::new(flow, beside, options.wire_factor)
-            .map_err(|detail| CliError::Invalid(format!("{}: flows[{at}]: {detail}", options.file.display())))?;
+        let planned_flow = Planned::new(flow, beside, options.wire_factor).map_err(|detail| {
+            CliError::Invalid(format!("{}: flows[{at}]: {detail}", options.file.display()))
+        })?;
         if let Some(before) = seen.insert(planned_flow.flow.clone(), at) {
             return Err(CliError::Invalid(format!(
                 "{}: flows[{at}]: is {}, as flows[{before}] is",
@@ -85,10 +88,8 @@ impl Planned {
     fn new(planned: &PlannedFlow, beside: &Path, wire_factor: f64) -> Result<Self, String> {
         let (flow, section) = match &planned.source {
             FlowSource::Inline { flow, bandwidth } => {
-                let section = FlowSection {
-                    bandwidth: (**bandwidth).clone(),
-                    ..FlowSection::default()
-                };
+                let section =
+                    FlowSection { bandwidth: (**bandwidth).clone(), ..FlowSection::default() };
                 (flow.clone(), section)
             }
             FlowSource::NodeFile(path) => {
@@ -100,7 +101,8 @@ impl Planned {
                 (flow, file.flow)
             }
         };
-        let topics: Vec<PlannedTopic> = planned.topics.iter().map(|topic| with_rules(topic, &section)).collect();
+        let topics: Vec<PlannedTopic> =
+            planned.topics.iter().map(|topic| with_rules(topic, &section)).collect();
         let bandwidth = section.bandwidth;
         let demands: Vec<Demand<'_>> = topics.iter().map(demand).collect();
         let budgets = Budgets {
@@ -108,26 +110,20 @@ impl Planned {
             links: bandwidth
                 .links
                 .keys()
-                .filter_map(|layer| Some((layer.clone(), bandwidth.link_limit_bytes_per_s(layer)? / wire_factor)))
+                .filter_map(|layer| {
+                    Some((layer.clone(), bandwidth.link_limit_bytes_per_s(layer)? / wire_factor))
+                })
                 .collect(),
             ..Budgets::default()
         };
         let rates = rates(&budgets, &terms(&bandwidth), &demands);
-        Ok(Self {
-            flow,
-            bandwidth,
-            topics,
-            rates,
-            wire_factor,
-        })
+        Ok(Self { flow, bandwidth, topics, rates, wire_factor })
     }
 
     /// What the link to a layer may carry: its own limit, else that of the process.
     fn limit(&self, layer: &LayerName) -> f64 {
         let process = self.bandwidth.limit_bytes_per_s();
-        self.bandwidth
-            .link_limit_bytes_per_s(layer)
-            .map_or(process, |own| own.min(process))
+        self.bandwidth.link_limit_bytes_per_s(layer).map_or(process, |own| own.min(process))
     }
 
     fn load(&self, layer: &LayerName) -> f64 {
@@ -140,17 +136,26 @@ impl Planned {
             .map(|layer| {
                 let (load, limit) = (self.load(layer), self.limit(layer));
                 json!({
-                    "from": self.flow, "to": layer, "load_bytes_per_s": load, "limit_bytes_per_s": limit,
+                    "from": self.flow, "to": layer, "load_bytes_per_s": load,
+                    "limit_bytes_per_s": limit,
                     "utilisation": load / limit,
                 })
             })
             .collect()
     }
 
-    /// As `/v1/allocation` of the running flow would say it; what only a running flow knows is null.
+    /// As `/v1/allocation` of the running flow would say it; what only a running flow knows is
+    /// null.
     fn allocation(&self) -> Value {
         let topic = |(topic, rates): (&PlannedTopic, &blaze_flow::limit::rates::TopicRates)| {
-            let lane = |(lane, hz): (&blaze_domain::node_file::PlannedLane, &f64)| json!({"layer": lane.layer, "allocated_hz": hz, "actual_hz": null, "skipped": null});
+            let lane = |(lane, hz): (&blaze_domain::node_file::PlannedLane, &f64)| {
+                json!({
+                    "layer": lane.layer,
+                    "allocated_hz": hz,
+                    "actual_hz": null,
+                    "skipped": null,
+                })
+            };
             json!({
                 "topic": topic.topic, "class": rates.class.as_str(), "size_bytes": topic.bytes,
                 "advertised_hz": advertised_hz(topic),
@@ -255,9 +260,7 @@ fn lanes(flow: &Planned, width: Option<u16>) -> String {
             ("TOPIC", Align::Left, &|(topic, ..)| topic.topic.to_string()),
             ("CLASS", Align::Left, &|(_, class, ..)| class.as_str().to_owned()),
             ("BYTES", Align::Right, &|(topic, ..)| topic.bytes.to_string()),
-            ("ADVERTISED/Hz", Align::Right, &|(topic, ..)| {
-                number(Some(advertised_hz(topic)), 2)
-            }),
+            ("ADVERTISED/Hz", Align::Right, &|(topic, ..)| number(Some(advertised_hz(topic)), 2)),
             ("TO", Align::Left, &|(_, _, lane, _)| lane.layer.to_string()),
             ("ASKED/Hz", Align::Right, &|(_, _, lane, _)| number(lane.max_rate_hz, 2)),
             ("ALLOCATED/Hz", Align::Right, &|(.., hz)| number(Some(*hz), 2)),
@@ -276,10 +279,7 @@ mod tests {
         let node_file = "layer: {name: edge, kind: edge}\nnode: {name: robot-1}\nflow: {bandwidth: {limit_mbps: 8}, topics: [{match: 'camera/**', max_rate_hz: 1}]}\n";
         std::fs::write(folder.path().join("robot-1.yaml"), node_file).unwrap();
         let plan = read(&file).map_err(|error| error.to_string())?;
-        plan.flows
-            .iter()
-            .map(|flow| Planned::new(flow, folder.path(), 1.0))
-            .collect()
+        plan.flows.iter().map(|flow| Planned::new(flow, folder.path(), 1.0)).collect()
     }
 
     /// With compression a running flow shows less than 1; headers of small messages make it many.
@@ -297,7 +297,8 @@ mod tests {
         }
     }
 
-    /// The three layers of the paper: 160 Mbit/s, a camera of 30 Hz with images of 0.7 MB after compression, and an IMU.
+    /// The three layers of the paper: 160 Mbit/s, a camera of 30 Hz with images of 0.7 MB after
+    /// compression, and an IMU.
     #[test]
     fn the_example_of_the_documentation_comes_out_as_printed() {
         let planned = plan_of(
@@ -311,15 +312,9 @@ mod tests {
         assert_eq!(lanes[0]["allocated_hz"], 10.0);
         // β · 20,971,520 B/s are 27.9 images of 714,000 B: ten of them go to the fog.
         let cloud = lanes[1]["allocated_hz"].as_f64().unwrap();
-        assert!(
-            (cloud - (0.95 * 20_971_520.0 / 714_000.0 - 10.0)).abs() < 1e-9,
-            "{cloud}"
-        );
+        assert!((cloud - (0.95 * 20_971_520.0 / 714_000.0 - 10.0)).abs() < 1e-9, "{cloud}");
         let links = planned[0].links();
-        let load: f64 = links
-            .iter()
-            .map(|link| link["load_bytes_per_s"].as_f64().unwrap())
-            .sum();
+        let load: f64 = links.iter().map(|link| link["load_bytes_per_s"].as_f64().unwrap()).sum();
         assert!(load <= 20_971_520.0, "{load}");
     }
 
@@ -348,9 +343,6 @@ mod tests {
             "{error}"
         );
         let missing = plan_of("flows: [{node_file: none.yaml, topics: []}]").err().unwrap();
-        assert!(
-            missing.contains("none.yaml") && missing.contains("cannot be opened"),
-            "{missing}"
-        );
+        assert!(missing.contains("none.yaml") && missing.contains("cannot be opened"), "{missing}");
     }
 }

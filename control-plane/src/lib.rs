@@ -1,4 +1,5 @@
-//! BlazeConfig main service: the configuration of layers, nodes, services and instances of the whole system.
+//! BlazeConfig main service: the configuration of layers, nodes, services and instances of the
+//! whole system.
 //!
 //! ```text
 //! listen ─▶ api: rest, grpc ─▶ core: rules, committer, watches ─▶ store: SQLite, MongoDB
@@ -6,7 +7,8 @@
 //!                └── auth ────────────┴── secrets
 //! ```
 //!
-//! Interfaces translate and decide nothing; the core decides and does no I/O of its own; a store keeps commits in order.
+//! Interfaces translate and decide nothing; the core decides and does no I/O of its own; a store
+//! keeps commits in order.
 
 // Test data that the conformance suite shares names this crate from outside.
 #[cfg(test)]

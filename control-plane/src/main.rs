@@ -11,8 +11,8 @@ use blaze_runtime::supervisor::{block_on, exit_code};
 use blaze_runtime::{forbid_core_dumps, logs, say};
 use clap::{Parser, Subcommand};
 
-/// A commit makes and drops thousands of small texts and map nodes on other threads than it began on: with the allocator
-/// of glibc that took more than a third of its time.
+/// A commit makes and drops thousands of small texts and map nodes on other threads than it began
+/// on: with the allocator of glibc that took more than a third of its time.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
@@ -20,11 +20,12 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 #[derive(Parser)]
 #[command(name = "blaze-config", version)]
 struct Arguments {
-    /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml (the last two not with --dev).
+    /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml (the last two not with
+    /// --dev).
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
-    /// Only check the configuration, with the key and certificate files that it names: every fault on stderr, exit code 0
-    /// or 64. The store is not looked at.
+    /// Only check the configuration, with the key and certificate files that it names: every fault
+    /// on stderr, exit code 0 or 64. The store is not looked at.
     #[arg(long)]
     check: bool,
     /// text or json; else as the node file says.
@@ -33,7 +34,8 @@ struct Arguments {
     /// Overrides one key, as control_plane.rest.listen=127.0.0.1:0; may be repeated.
     #[arg(long, value_name = "KEY=VALUE", value_parser = parse_override, global = true)]
     set: Vec<(String, String)>,
-    /// For trying things out: loopback alone, no token needed, in memory unless a store is named, no node file needed.
+    /// For trying things out: loopback alone, no token needed, in memory unless a store is named,
+    /// no node file needed.
     #[arg(long)]
     dev: bool,
     /// What to do; serve if nothing is said.
@@ -99,11 +101,7 @@ fn main() -> ExitCode {
         dev: arguments.dev,
         in_memory: arguments.dev && !named && !names_store,
     };
-    let checked = if arguments.check {
-        setup.check_all()
-    } else {
-        setup.check()
-    };
+    let checked = if arguments.check { setup.check_all() } else { setup.check() };
     if let Err(faults) = checked {
         faults.iter().for_each(|fault| say(format_args!("{fault}")));
         return ExitCode::from(exit_code::CONFIGURATION);

@@ -6,22 +6,22 @@
 //! watches ──watcher() … dropped─────────────────────────┘
 //! ```
 //!
-//! Labels come from closed sets (operations, error codes) or from documents (layers and nodes), never from a request.
+//! Labels come from closed sets (operations, error codes) or from documents (layers and nodes),
+//! never from a request.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use prometheus::core::Collector;
 use prometheus::{
-    Encoder, Gauge, GaugeVec, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec,
-    Opts, Registry, TextEncoder,
+    Encoder, Gauge, GaugeVec, Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec,
+    IntGauge, IntGaugeVec, Opts, Registry, TextEncoder,
 };
 
 use crate::core::CommitReport;
 
 /// Upper bounds of durations, in seconds.
-const SECONDS: &[f64] = &[
-    0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0,
-];
+const SECONDS: &[f64] =
+    &[0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0];
 
 /// Upper bounds of the number of requests in one transaction.
 const REQUESTS: &[f64] = &[1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0];
@@ -50,16 +50,10 @@ impl std::fmt::Debug for ApiMetrics {
     }
 }
 
-/// What becomes of a connection: taken, or over the limit of connections; the TLS handshake failed or took too long; no
-/// first request came in time; the client took no byte for long.
-const CONNECTION_RESULTS: [&str; 6] = [
-    "accepted",
-    "refused",
-    "handshake_failed",
-    "handshake_timeout",
-    "timeout",
-    "stalled",
-];
+/// What becomes of a connection: taken, or over the limit of connections; the TLS handshake failed
+/// or took too long; no first request came in time; the client took no byte for long.
+const CONNECTION_RESULTS: [&str; 6] =
+    ["accepted", "refused", "handshake_failed", "handshake_timeout", "timeout", "stalled"];
 
 /// One of what a gauge counts; counted no more when dropped.
 #[derive(Debug)]
@@ -123,32 +117,45 @@ impl ApiMetrics {
         );
         let unfinished = Opts::new(
             "blaze_config_commits_failed_total",
-            "Transactions that were not written: another process was first (conflict), or the store failed (store).",
+            "Transactions that were not written: another process was first (conflict), or the \
+             store failed (store).",
         );
         let build = Opts::new("blaze_build_info", "1, with the version as label.");
         let build = register(&registry, IntGaugeVec::new(build, &["version", "program"])?)?;
-        build
-            .with_label_values(&[env!("CARGO_PKG_VERSION"), "blaze-config"])
-            .set(1);
-        let started = Gauge::new("process_start_time_seconds", "When the process started, since 1970.")?;
+        build.with_label_values(&[env!("CARGO_PKG_VERSION"), "blaze-config"]).set(1);
+        let started =
+            Gauge::new("process_start_time_seconds", "When the process started, since 1970.")?;
         let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         register(&registry, started)?.set(since.as_secs_f64());
         let lag = Opts::new(
             "blaze_config_worker_lag_revisions",
             "Revisions that a connected worker is behind.",
         );
-        let connections = Opts::new("blaze_config_connections_total", "Connections by what became of them.");
+        let connections =
+            Opts::new("blaze_config_connections_total", "Connections by what became of them.");
         let open_connections = Opts::new("blaze_config_connections", "Connections that are open.");
         Ok(Self {
-            connections: register(&registry, IntCounterVec::new(connections, &["listener", "result"])?)?,
-            open_connections: register(&registry, IntGaugeVec::new(open_connections, &["listener"])?)?,
-            requests: register(&registry, IntCounterVec::new(requests, &["api", "operation", "code"])?)?,
+            connections: register(
+                &registry,
+                IntCounterVec::new(connections, &["listener", "result"])?,
+            )?,
+            open_connections: register(
+                &registry,
+                IntGaugeVec::new(open_connections, &["listener"])?,
+            )?,
+            requests: register(
+                &registry,
+                IntCounterVec::new(requests, &["api", "operation", "code"])?,
+            )?,
             durations: register(
                 &registry,
                 HistogramVec::new(durations.buckets(SECONDS.to_vec()), &["api", "operation"])?,
             )?,
             commits: register(&registry, Histogram::with_opts(commits.buckets(SECONDS.to_vec()))?)?,
-            batches: register(&registry, Histogram::with_opts(batches.buckets(REQUESTS.to_vec()))?)?,
+            batches: register(
+                &registry,
+                Histogram::with_opts(batches.buckets(REQUESTS.to_vec()))?,
+            )?,
             unfinished: register(&registry, IntCounterVec::new(unfinished, &["reason"])?)?,
             oldest: register(
                 &registry,
@@ -172,7 +179,10 @@ impl ApiMetrics {
                 &registry,
                 IntGauge::new("blaze_config_revision", "Revision that this process has applied.")?,
             )?,
-            watchers: register(&registry, IntGauge::new("blaze_config_watchers", "Open watches.")?)?,
+            watchers: register(
+                &registry,
+                IntGauge::new("blaze_config_watchers", "Open watches.")?,
+            )?,
             lag: register(&registry, GaugeVec::new(lag, &["layer", "node"])?)?,
             registry,
         })
@@ -181,9 +191,7 @@ impl ApiMetrics {
     /// Counts a request. `code` is `ok` or the error code as it is written.
     pub fn observe(&self, api: &str, operation: &str, code: &str, duration: Duration) {
         self.requests.with_label_values(&[api, operation, code]).inc();
-        self.durations
-            .with_label_values(&[api, operation])
-            .observe(duration.as_secs_f64());
+        self.durations.with_label_values(&[api, operation]).observe(duration.as_secs_f64());
     }
 
     /// Counts a transaction.
@@ -197,8 +205,8 @@ impl ApiMetrics {
         }
     }
 
-    /// What the core holds now: the revision that is applied, the oldest one that is kept, documents, and refusals that
-    /// are missing in the audit so far.
+    /// What the core holds now: the revision that is applied, the oldest one that is kept,
+    /// documents, and refusals that are missing in the audit so far.
     pub fn state(&self, revision: u64, oldest: u64, documents: usize, skipped: u64) {
         self.revision.set(i64::try_from(revision).unwrap_or(i64::MAX));
         self.oldest.set(i64::try_from(oldest).unwrap_or(i64::MAX));
@@ -225,7 +233,8 @@ impl ApiMetrics {
         }
     }
 
-    /// How far the connected workers are behind, by layer and node; those that are not named have gone.
+    /// How far the connected workers are behind, by layer and node; those that are not named have
+    /// gone.
     pub fn worker_lags<'a>(&self, lags: impl IntoIterator<Item = (&'a str, &'a str, u64)>) {
         self.lag.reset();
         for (layer, node, revisions) in lags {
@@ -247,7 +256,10 @@ impl ApiMetrics {
     }
 }
 
-fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: M) -> prometheus::Result<M> {
+fn register<M: Collector + Clone + 'static>(
+    registry: &Registry,
+    metric: M,
+) -> prometheus::Result<M> {
     registry.register(Box::new(metric.clone()))?;
     Ok(metric)
 }
@@ -267,11 +279,7 @@ mod tests {
             conflict: false,
         };
         metrics.commit(&report);
-        let conflict = CommitReport {
-            committed: false,
-            conflict: true,
-            ..report
-        };
+        let conflict = CommitReport { committed: false, conflict: true, ..report };
         metrics.commit(&conflict);
         for _ in 0..2 {
             metrics.state(412, 7, 10, 5);

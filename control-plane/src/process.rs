@@ -62,16 +62,20 @@ impl Setup {
     /// Every reason, one a line.
     pub fn check(&self) -> Result<(), Vec<String>> {
         let mut faults = check_startup(&self.section, self.dev).err().unwrap_or_default();
-        if cfg!(not(feature = "mongodb")) && matches!(self.section.store, StoreSection::MongoDb { .. }) {
+        if cfg!(not(feature = "mongodb"))
+            && matches!(self.section.store, StoreSection::MongoDb { .. })
+        {
             faults.push(
-                "control_plane.store.mongodb: this program was built without MongoDB (cargo feature `mongodb`)"
+                "control_plane.store.mongodb: this program was built without MongoDB (cargo \
+                 feature `mongodb`)"
                     .to_owned(),
             );
         }
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
 
-    /// The same, and whether every file with a key or a certificate can be used. The store is not looked at.
+    /// The same, and whether every file with a key or a certificate can be used. The store is not
+    /// looked at.
     ///
     /// # Errors
     /// Every reason, one a line, with its place in the node file.
@@ -87,7 +91,10 @@ impl Setup {
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
 
-    pub(crate) async fn open(&self, supervisor: &Supervisor) -> Result<Arc<dyn FullStore>, StoreError> {
+    pub(crate) async fn open(
+        &self,
+        supervisor: &Supervisor,
+    ) -> Result<Arc<dyn FullStore>, StoreError> {
         match self.in_memory {
             true => store::in_memory(supervisor).await,
             false => store::open(&self.section.store, supervisor).await,
@@ -109,11 +116,7 @@ impl Keys {
         let authenticator = section.auth.as_ref().map(Authenticator::load).transpose();
         let keyring = Keyring::load(&section.encryption);
         match (authenticator, keyring, Tls::load(&section.tls)) {
-            (Ok(authenticator), Ok(keyring), Ok(tls)) => Ok(Self {
-                keyring,
-                authenticator,
-                tls,
-            }),
+            (Ok(authenticator), Ok(keyring), Ok(tls)) => Ok(Self { keyring, authenticator, tls }),
             (authenticator, keyring, tls) => {
                 let faults = [authenticator.err(), keyring.err(), tls.err()];
                 Err(faults.into_iter().flatten().flatten().collect())
@@ -155,14 +158,8 @@ pub async fn run(setup: Setup, command: Command) -> ExitCode {
 }
 
 async fn migrate(supervisor: &Supervisor, setup: &Setup, dry_run: bool) -> anyhow::Result<()> {
-    let Plan {
-        version,
-        target,
-        pending,
-    } = store::plan(&setup.section.store).await?;
-    say(format_args!(
-        "the store has schema {version}, this program knows {target}"
-    ));
+    let Plan { version, target, pending } = store::plan(&setup.section.store).await?;
+    say(format_args!("the store has schema {version}, this program knows {target}"));
     for step in &pending {
         say(format_args!("to do: {step}"));
     }
@@ -182,9 +179,7 @@ async fn back_up(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyho
     let export = |pieces| store::export(&setup.section.store, supervisor, pieces);
     let written = backup::write(export, &mut out).await;
     let written = written.map_err(anyhow::Error::from).and_then(|summary| {
-        out.into_inner()
-            .map_err(std::io::IntoInnerError::into_error)?
-            .sync_all()?;
+        out.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_all()?;
         Ok(summary)
     });
     let summary = match written {
@@ -207,11 +202,7 @@ async fn back_up(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyho
 
 fn private_file(path: &std::path::Path) -> std::io::Result<std::fs::File> {
     use std::os::unix::fs::OpenOptionsExt as _;
-    std::fs::OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .mode(0o600)
-        .open(path)
+    std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
 
 async fn restore(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyhow::Result<()> {
@@ -248,9 +239,7 @@ async fn reencrypt(supervisor: &Supervisor, setup: &Setup) -> anyhow::Result<()>
     let replaced = store.rewrite(&reseal).await;
     store.close().await;
     let replaced = replaced?;
-    say(format_args!(
-        "{replaced} versions of documents are encrypted with the first key now"
-    ));
+    say(format_args!("{replaced} versions of documents are encrypted with the first key now"));
     let failed = failed.into_inner();
     failed.iter().for_each(|line| say(format_args!("{line}")));
     anyhow::ensure!(failed.is_empty(), "{} versions were left as they are", failed.len());
@@ -270,7 +259,8 @@ async fn serve(supervisor: &Supervisor, setup: Setup) -> ExitCode {
             return ExitCode::from(exit_code::FAILED);
         }
     };
-    let (announced, stopping, failing) = (Arc::clone(&main), supervisor.stopping_token(), supervisor.clone());
+    let (announced, stopping, failing) =
+        (Arc::clone(&main), supervisor.stopping_token(), supervisor.clone());
     supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {
         let Addresses { rest, grpc, admin } = tokio::select! {
             addresses = announced.ready() => addresses,
@@ -291,11 +281,7 @@ mod tests {
     use super::*;
 
     fn setup(section: ControlPlaneSection) -> Setup {
-        Setup {
-            section,
-            dev: false,
-            in_memory: false,
-        }
+        Setup { section, dev: false, in_memory: false }
     }
 
     #[test]
@@ -322,10 +308,8 @@ mod tests {
             }),
             ..ControlPlaneSection::default()
         };
-        section.encryption.keys = vec![EncryptionKey {
-            id: "e1".to_owned(),
-            file: path("nope.enc"),
-        }];
+        section.encryption.keys =
+            vec![EncryptionKey { id: "e1".to_owned(), file: path("nope.enc") }];
         section.tls.cert_file = Some(path("nope.pem"));
         section.tls.key_file = Some(path("nope.pem"));
         section.tls.client_ca_file = Some(path("nope.ca"));
@@ -341,9 +325,8 @@ mod tests {
             ("control_plane.tls.key_file: ", "nope.pem cannot be read"),
             ("control_plane.tls.client_ca_file: ", "nope.ca cannot be read"),
         ] {
-            let matching = found
-                .iter()
-                .filter(|fault| fault.starts_with(place) && fault.contains(part));
+            let matching =
+                found.iter().filter(|fault| fault.starts_with(place) && fault.contains(part));
             assert_eq!(matching.count(), 1, "{place}{part} in {found:#?}");
         }
         assert_eq!(found.len(), 9, "{found:#?}");

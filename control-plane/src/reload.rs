@@ -1,7 +1,8 @@
 //! Files that are read again when they change: keys, certificates.
 //!
-//! Their content is looked at once a second and compared by its hash. That finds every kind of change alike, also the
-//! swap of a symlink by Kubernetes and a file that is replaced by another of the same size and time.
+//! Their content is looked at once a second and compared by its hash. That finds every kind of
+//! change alike, also the swap of a symlink by Kubernetes and a file that is replaced by another of
+//! the same size and time.
 
 use std::fs::File;
 use std::io::{self, Read as _};
@@ -52,8 +53,9 @@ fn read(path: &Path) -> io::Result<Zeroizing<Vec<u8>>> {
     Ok(bytes)
 }
 
-/// Calls `reload` in the background whenever one of the files has changed, and once soon after the start: a change
-/// between the first reading and the first look is not missed. What faults it gives is logged; what held before stays.
+/// Calls `reload` in the background whenever one of the files has changed, and once soon after the
+/// start: a change between the first reading and the first look is not missed. What faults it gives
+/// is logged; what held before stays.
 pub(crate) fn watch_files(
     supervisor: &Supervisor,
     name: &str,
@@ -118,10 +120,7 @@ async fn run(
 async fn look(files: &Arc<[PathBuf]>) -> Option<Look> {
     let files = Arc::clone(files);
     let hashes = move || {
-        files
-            .iter()
-            .map(|file| read_file(file).ok().and_then(|bytes| hash(&bytes)))
-            .collect()
+        files.iter().map(|file| read_file(file).ok().and_then(|bytes| hash(&bytes))).collect()
     };
     tokio::task::spawn_blocking(hashes).await.ok()
 }
@@ -149,10 +148,8 @@ mod tests {
         symlink(path("one"), path("data")).unwrap();
         let file = path("data").join("key");
         let supervisor = Supervisor::new("test");
-        let (calls, counted) = (
-            Arc::new(AtomicUsize::new(0)),
-            tokio::sync::watch::Sender::new(String::new()),
-        );
+        let (calls, counted) =
+            (Arc::new(AtomicUsize::new(0)), tokio::sync::watch::Sender::new(String::new()));
         let mut told = counted.subscribe();
         let (seen, count) = (file.clone(), Arc::clone(&calls));
         watch_files(&supervisor, "test", vec![file], Duration::from_millis(10), move || {

@@ -1,5 +1,5 @@
-//! A main service that runs, in a process of its own or within another program: what it is built of, and in which order it
-//! begins and ends.
+//! A main service that runs, in a process of its own or within another program: what it is built
+//! of, and in which order it begins and ends.
 //!
 //! ```text
 //! admin ─▶ keys ─▶ store (migrated; waited for) ─▶ core ─▶ REST, gRPC ─▶ ready
@@ -55,8 +55,8 @@ struct Built {
 }
 
 impl RunningMain {
-    /// Starts it; returns as soon as the admin port listens. The store may come later. What cannot work then is a failure of the
-    /// supervisor.
+    /// Starts it; returns as soon as the admin port listens. The store may come later. What cannot
+    /// work then is a failure of the supervisor.
     ///
     /// # Errors
     /// When the admin port cannot be bound.
@@ -82,14 +82,11 @@ impl RunningMain {
                 Err(error) => inside.fail(format!("{error:#}")),
             }
         });
-        Ok(Self {
-            readiness,
-            admin,
-            built,
-        })
+        Ok(Self { readiness, admin, built })
     }
 
-    /// Waits until it serves, and says where. It waits for ever where the supervisor has failed before.
+    /// Waits until it serves, and says where. It waits for ever where the supervisor has failed
+    /// before.
     pub async fn ready(&self) -> Addresses {
         let mut built = self.built.subscribe();
         let is_built = built.wait_for(Option::is_some).await;
@@ -102,14 +99,11 @@ impl RunningMain {
             return std::future::pending().await;
         };
         self.readiness.ready().await;
-        Addresses {
-            rest,
-            grpc,
-            admin: self.admin,
-        }
+        Addresses { rest, grpc, admin: self.admin }
     }
 
-    /// The steps of its orderly end, behind those that there are. The supervisor has to run on while they are taken.
+    /// The steps of its orderly end, behind those that there are. The supervisor has to run on
+    /// while they are taken.
     #[must_use]
     pub fn shutdown_steps(&self, steps: ShutdownSteps) -> ShutdownSteps {
         let readiness = self.readiness.clone();
@@ -163,7 +157,8 @@ async fn admin(
         metrics.text()
     };
     let address = setup.section.admin.listen;
-    let server = AdminServer::bind(address, axum::Router::new(), readiness.clone(), Arc::new(text)).await?;
+    let server =
+        AdminServer::bind(address, axum::Router::new(), readiness.clone(), Arc::new(text)).await?;
     let address = server.address();
     server.serve(supervisor);
     Ok(address)
@@ -184,7 +179,9 @@ async fn open_store(
         };
         match waiting.news(&error.to_string(), Instant::now()) {
             News::Other(hint) => tracing::warn!(%error, hint, "waiting for the store"),
-            News::Still => tracing::warn!("still waiting for the store, for the reason that was told before"),
+            News::Still => {
+                tracing::warn!("still waiting for the store, for the reason that was told before")
+            }
             News::None => tracing::debug!(%error, "waiting for the store"),
         }
         readiness.set("store", CheckStatus::Failed, error.told());
@@ -202,11 +199,7 @@ async fn build(
     let section = &setup.section;
     let keys = Keys::read(section).map_err(all_of)?;
     keys.watch(supervisor);
-    let Keys {
-        keyring,
-        authenticator,
-        tls,
-    } = keys;
+    let Keys { keyring, authenticator, tls } = keys;
     let store = open_store(supervisor, setup, readiness).await?;
     let told = Arc::clone(metrics);
     let options = CoreOptions {
@@ -248,8 +241,10 @@ async fn build(
         ..ListenLimits::default()
     };
     let rest_port = section.rest.listen;
-    let rest_port = Listener::bind("rest", rest_port, tls.clone(), Protocols::Both, listen.clone()).await?;
-    let grpc_port = Listener::bind("grpc", section.grpc.listen, tls, Protocols::Http2, listen).await?;
+    let rest_port =
+        Listener::bind("rest", rest_port, tls.clone(), Protocols::Both, listen.clone()).await?;
+    let grpc_port =
+        Listener::bind("grpc", section.grpc.listen, tls, Protocols::Http2, listen).await?;
     Ok(Built {
         rest: rest_port.serve(supervisor, rest, metrics),
         grpc: grpc_port.serve(supervisor, grpc, metrics),

@@ -5,8 +5,8 @@
 //!                 ▲ bound to kind, service, name, uid: what is copied to another document does not open there
 //! ```
 //!
-//! The first key encrypts, all decrypt. To rotate: put a new key first, `reencrypt`, take the old one away (backups keep
-//! needing it). A random nonce of 96 bits allows 2^32 secrets per key.
+//! The first key encrypts, all decrypt. To rotate: put a new key first, `reencrypt`, take the old
+//! one away (backups keep needing it). A random nonce of 96 bits allows 2^32 secrets per key.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -37,7 +37,9 @@ const TAG_BYTES: usize = 16;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SealError {
     /// No key is configured.
-    #[error("the service has no key to encrypt secrets with; name one in control_plane.encryption.keys")]
+    #[error(
+        "the service has no key to encrypt secrets with; name one in control_plane.encryption.keys"
+    )]
     NoKey,
     /// The library failed.
     #[error("the secret cannot be encrypted")]
@@ -53,8 +55,12 @@ pub enum OpenError {
     /// It is none, or its parts are broken.
     #[error("it has not the form of a stored secret")]
     Form,
-    /// It was changed, belongs to another document, or the key of that id was replaced by another one.
-    #[error("it does not open with key {0:?}: it was changed, or the key is another one than that it was made with")]
+    /// It was changed, belongs to another document, or the key of that id was replaced by another
+    /// one.
+    #[error(
+        "it does not open with key {0:?}: it was changed, or the key is another one than that it \
+         was made with"
+    )]
     Refused(String),
     /// Encrypting it again failed.
     #[error("{0}")]
@@ -94,11 +100,7 @@ impl Keyring {
                 Err(fault) => faults.push(fault),
             }
         }
-        if faults.is_empty() {
-            Ok(Self::build(section.keys.clone(), keys))
-        } else {
-            Err(faults)
-        }
+        if faults.is_empty() { Ok(Self::build(section.keys.clone(), keys)) } else { Err(faults) }
     }
 
     /// Without keys: nothing is encrypted and nothing opens.
@@ -112,7 +114,8 @@ impl Keyring {
     /// # Errors
     /// If a key is refused by the library.
     pub fn with_keys(keys: &[(&str, [u8; KEY_BYTES])]) -> Result<Self, SealError> {
-        let keys: Result<Vec<NamedKey>, SealError> = keys.iter().map(|(id, bytes)| NamedKey::new(id, bytes)).collect();
+        let keys: Result<Vec<NamedKey>, SealError> =
+            keys.iter().map(|(id, bytes)| NamedKey::new(id, bytes)).collect();
         Ok(Self::build(Vec::new(), keys?))
     }
 
@@ -143,7 +146,8 @@ impl Keyring {
         !self.shared.keys.load().is_empty()
     }
 
-    /// Encrypts a text for one document; `version` is the revision at which it changes. Gives the stored form.
+    /// Encrypts a text for one document; `version` is the revision at which it changes. Gives the
+    /// stored form.
     ///
     /// # Errors
     /// [`SealError`].
@@ -171,11 +175,13 @@ impl Keyring {
     ///
     /// # Errors
     /// [`OpenError`].
-    pub fn open(&self, key: &Key, uid: &str, stored: &Value) -> Result<Zeroizing<String>, OpenError> {
-        let Some(Ok(Secret::Stored {
-            key: id, nonce, data, ..
-        })) = Secret::of(stored)
-        else {
+    pub fn open(
+        &self,
+        key: &Key,
+        uid: &str,
+        stored: &Value,
+    ) -> Result<Zeroizing<String>, OpenError> {
+        let Some(Ok(Secret::Stored { key: id, nonce, data, .. })) = Secret::of(stored) else {
             return Err(OpenError::Form);
         };
         let keys = self.shared.keys.load();
@@ -186,15 +192,13 @@ impl Keyring {
         let mut bytes = Zeroizing::new(STANDARD.decode(data).map_err(|_| OpenError::Form)?);
         let bound = Aad::from(binding(key, uid));
         let refused = || OpenError::Refused(id.to_owned());
-        let text = named
-            .key
-            .open_in_place(nonce, bound, &mut bytes)
-            .map_err(|_| refused())?;
+        let text = named.key.open_in_place(nonce, bound, &mut bytes).map_err(|_| refused())?;
         let text = std::str::from_utf8(text).map_err(|_| OpenError::Form)?;
         Ok(Zeroizing::new(text.to_owned()))
     }
 
-    /// The document with all its secrets under the first key, versions as they are; `None` if they are so already.
+    /// The document with all its secrets under the first key, versions as they are; `None` if they
+    /// are so already.
     ///
     /// # Errors
     /// The first secret that does not open.
@@ -234,7 +238,8 @@ impl Keyring {
                 return None;
             }
             let text = self.open(&document.key, &document.uid, found);
-            let sealed = text.and_then(|text| Ok(self.seal(&document.key, &document.uid, &text, version)?));
+            let sealed = text
+                .and_then(|text| Ok(self.seal(&document.key, &document.uid, &text, version)?));
             changed |= sealed.is_ok();
             sealed.map_err(|error| failed = Some(error)).ok()
         });
@@ -256,10 +261,7 @@ impl fmt::Debug for Keyring {
 impl NamedKey {
     fn new(id: &str, bytes: &[u8; KEY_BYTES]) -> Result<Self, SealError> {
         let key = RandomizedNonceKey::new(&AES_256_GCM, bytes).map_err(|_| SealError::Failed)?;
-        Ok(Self {
-            id: id.to_owned(),
-            key: Arc::new(key),
-        })
+        Ok(Self { id: id.to_owned(), key: Arc::new(key) })
     }
 }
 
@@ -298,9 +300,7 @@ impl Shared {
 /// What a secret belongs to. None of the parts can hold the separator.
 fn binding(key: &Key, uid: &str) -> Vec<u8> {
     let service = key.service_name().map_or("", ServiceName::as_str);
-    [key.kind().as_str(), service, key.name().as_str(), uid]
-        .join("\0")
-        .into_bytes()
+    [key.kind().as_str(), service, key.name().as_str(), uid].join("\0").into_bytes()
 }
 
 #[cfg(test)]

@@ -14,7 +14,8 @@ fn key(text: &str) -> Key {
 }
 
 fn ring(ids: &[(&str, u8)]) -> Keyring {
-    let keys: Vec<(&str, [u8; KEY_BYTES])> = ids.iter().map(|(id, fill)| (*id, [*fill; KEY_BYTES])).collect();
+    let keys: Vec<(&str, [u8; KEY_BYTES])> =
+        ids.iter().map(|(id, fill)| (*id, [*fill; KEY_BYTES])).collect();
     Keyring::with_keys(&keys).unwrap()
 }
 
@@ -50,10 +51,7 @@ fn a_secret_opens_where_it_belongs() {
     for other in ["Instance/slam/1", "Instance/slam2/0", "Service/slam", "Node/slam"] {
         assert_eq!(ring.open(&key(other), UID, &stored), refused, "{other}");
     }
-    assert_eq!(
-        ring.open(&here, "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d12", &stored),
-        refused
-    );
+    assert_eq!(ring.open(&here, "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d12", &stored), refused);
     // A new nonce each time: equal texts do not show.
     assert_ne!(ring.seal(&here, UID, "canary", 412).unwrap(), stored);
     assert_eq!(format!("{ring:?}"), "[\"e1\"]");
@@ -90,7 +88,8 @@ fn what_is_no_stored_secret_does_not_open() {
     ] {
         assert_eq!(ring.open(&here, UID, &value), Err(OpenError::Form), "{value}");
     }
-    let short = json!({ "$secret": { "key": "e1", "nonce": "AAAAAAAAAAAAAAAA", "data": "AAAA", "version": 1 } });
+    let short = json!({ "$secret": { "key": "e1", "nonce": "AAAAAAAAAAAAAAAA", "data": "AAAA",
+        "version": 1 } });
     assert!(matches!(ring.open(&here, UID, &short), Err(OpenError::Refused(_))));
 }
 
@@ -117,15 +116,10 @@ fn reencrypting_moves_what_is_under_an_old_key() {
 #[tokio::test]
 async fn changed_files_are_read_again_and_faulty_ones_are_not_used() {
     let folder = tempfile::tempdir().unwrap();
-    let file = |id: &str| EncryptionKey {
-        id: id.to_owned(),
-        file: folder.path().join(id),
-    };
+    let file = |id: &str| EncryptionKey { id: id.to_owned(), file: folder.path().join(id) };
     write(&file("e1").file, 1);
     write(&file("e2").file, 2);
-    let section = EncryptionSection {
-        keys: vec![file("e1"), file("e2")],
-    };
+    let section = EncryptionSection { keys: vec![file("e1"), file("e2")] };
     let keys = Keyring::load(&section).unwrap();
     let supervisor = Supervisor::new("test");
     keys.watch_every(&supervisor, Duration::from_millis(10));
@@ -151,7 +145,8 @@ async fn changed_files_are_read_again_and_faulty_ones_are_not_used() {
 
 proptest! {
     #[test]
-    fn any_text_comes_back_and_no_change_passes(text in ".{0,80}", place in any::<usize>(), flip in 1_u8..) {
+    fn any_text_comes_back_and_no_change_passes(text in ".{0,80}", place in any::<usize>(),
+        flip in 1_u8..) {
         let ring = ring(&[("e1", 1)]);
         let here = key("Layer/edge");
         let stored = ring.seal(&here, UID, &text, 1).unwrap();

@@ -58,9 +58,10 @@ fn without_numbers(text: &str) -> String {
 
 /// MongoDB's driver tells the state of each member in words alone.
 fn hint(reason: &str) -> Option<&'static str> {
-    reason
-        .contains("RsGhost")
-        .then_some("a member says that its replica set was never initiated: run rs.initiate() once, on one member")
+    reason.contains("RsGhost").then_some(
+        "a member says that its replica set was never initiated: run rs.initiate() \
+            once, on one member",
+    )
 }
 
 #[cfg(test)]
@@ -71,8 +72,10 @@ mod tests {
     fn a_reason_to_wait_is_told_once() {
         let ghost = |rtt: &str| {
             format!(
-                "MongoDB: Server selection timeout: No available servers. Topology: {{ Type: ReplicaSetNoPrimary, Servers: \
-                 [ {{ Address: 127.0.0.1:27017, Type: RsGhost, Average RTT: {rtt}, Last Update Time: 2026-11-23 9:12:33.5 }} ] }}"
+                "MongoDB: Server selection timeout: No available servers. Topology: {{ Type: \
+                 ReplicaSetNoPrimary, Servers: \
+                 [ {{ Address: 127.0.0.1:27017, Type: RsGhost, Average RTT: {rtt}, Last Update \
+                 Time: 2026-11-23 9:12:33.5 }} ] }}"
             )
         };
         let (mut waiting, start) = (Waiting::default(), Instant::now());
@@ -80,22 +83,10 @@ mod tests {
             panic!("the first reason is news");
         };
         assert!(hint.contains("rs.initiate()"));
-        assert_eq!(
-            waiting.news(&ghost("820µs"), start + Duration::from_secs(2)),
-            News::None
-        );
-        assert_eq!(
-            waiting.news(&ghost("2.5 ms"), start + Duration::from_secs(59)),
-            News::None
-        );
-        assert_eq!(
-            waiting.news(&ghost("2 ms"), start + Duration::from_secs(61)),
-            News::Still
-        );
-        assert_eq!(
-            waiting.news(&ghost("2 ms"), start + Duration::from_secs(63)),
-            News::None
-        );
+        assert_eq!(waiting.news(&ghost("820µs"), start + Duration::from_secs(2)), News::None);
+        assert_eq!(waiting.news(&ghost("2.5 ms"), start + Duration::from_secs(59)), News::None);
+        assert_eq!(waiting.news(&ghost("2 ms"), start + Duration::from_secs(61)), News::Still);
+        assert_eq!(waiting.news(&ghost("2 ms"), start + Duration::from_secs(63)), News::None);
         let other = "MongoDB: connection refused";
         assert_eq!(waiting.news(other, start + Duration::from_secs(64)), News::Other(None));
         assert!(matches!(waiting.news(&ghost("1 s"), start), News::Other(Some(_))));

@@ -18,14 +18,17 @@ use blaze_flow::world::LayerScopeId;
 use blaze_runtime::admin::Readiness;
 use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_typed, parse_override};
 use blaze_runtime::logs::{LogFormat, LogHandle};
-use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
+use blaze_runtime::supervisor::{
+    ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code,
+};
 use blaze_runtime::{environment, logs, ready_line, say, state};
 use clap::Parser;
 
 /// A shutdown takes at most this long.
 const SHUTDOWN: Duration = Duration::from_secs(5);
 
-/// BlazeFlow: connects whoever publishes a topic with whoever asks for it, on any broker, on any layer.
+/// BlazeFlow: connects whoever publishes a topic with whoever asks for it, on any broker, on any
+/// layer.
 #[derive(Parser)]
 #[command(name = "blaze-flow", version)]
 struct Arguments {
@@ -62,9 +65,12 @@ fn main() -> ExitCode {
     for warning in &loaded.warnings {
         say(format_args!("warning: {warning}"));
     }
-    if cfg!(not(feature = "kafka")) && matches!(loaded.value.brokers.layer, Some(LayerSection::Kafka(_))) {
+    if cfg!(not(feature = "kafka"))
+        && matches!(loaded.value.brokers.layer, Some(LayerSection::Kafka(_)))
+    {
         say(format_args!(
-            "warning: brokers.layer.kafka: this program was built without Kafka (cargo feature `kafka`) and cannot start with it"
+            "warning: brokers.layer.kafka: this program was built without Kafka (cargo feature \
+             `kafka`) and cannot start with it"
         ));
     }
     if arguments.check {
@@ -88,12 +94,7 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
             return ExitCode::from(exit_code::FAILED);
         }
     };
-    let followed = Followed {
-        sources,
-        loaded,
-        watch: WatchSettings::default(),
-        log: Some(log),
-    };
+    let followed = Followed { sources, loaded, watch: WatchSettings::default(), log: Some(log) };
     follow_node_file(&flow, followed, service.as_ref(), &supervisor, |_| {});
     let announced = Arc::clone(&flow);
     let stopping = supervisor.stopping_token();
@@ -123,10 +124,8 @@ async fn begin(
     let (flow, log) = start(supervisor, file).await?;
     let local = (&file.brokers.node, &file.brokers.layer);
     // In memory there is nobody but the flow itself.
-    let is_alone = matches!(
-        local,
-        (Some(NodeBroker::Memory), _) | (None, Some(LayerSection::Memory))
-    );
+    let is_alone =
+        matches!(local, (Some(NodeBroker::Memory), _) | (None, Some(LayerSection::Memory)));
     let service = match is_alone {
         true => None,
         false => FlowService::start(&flow, file.cache_redis().cloned(), supervisor)
@@ -136,42 +135,40 @@ async fn begin(
     Ok((Arc::new(flow), log, service))
 }
 
-async fn start(supervisor: &Supervisor, file: &NodeFile) -> anyhow::Result<(RunningFlow, LogHandle)> {
-    let format = if file.log.format.as_str() == "json" {
-        LogFormat::Json
-    } else {
-        LogFormat::Text
-    };
+async fn start(
+    supervisor: &Supervisor,
+    file: &NodeFile,
+) -> anyhow::Result<(RunningFlow, LogHandle)> {
+    let format = if file.log.format.as_str() == "json" { LogFormat::Json } else { LogFormat::Text };
     let log = logs::init(file.log.level.as_str(), format)?;
     let directory = state::state_directory(file.state_dir.as_deref())?;
     if let Some(refused) = &directory.instead_of {
-        tracing::warn!(directory = %directory.path.display(), instead_of = refused, "state is kept elsewhere");
+        tracing::warn!(
+            directory = %directory.path.display(),
+            instead_of = refused,
+            "state is kept elsewhere",
+        );
     }
     let settings = FlowSettings::try_from(file)?;
     let epochs = Epochs::begin(&settings.me, Some(&directory.path)).context("keeping the epoch")?;
-    let role = Role::Flow {
-        flow: settings.me.clone(),
-        epoch: epochs.first(),
-    };
+    let role = Role::Flow { flow: settings.me.clone(), epoch: epochs.first() };
     let node = node_broker(file, &settings, &role)?;
     let (layer, layer_prefix) = layer_broker(file, &settings, &role)?;
-    let options = FlowOptions {
-        settings,
-        node,
-        layer,
-        state_dir: Some(directory.path),
-    };
+    let options = FlowOptions { settings, node, layer, state_dir: Some(directory.path) };
     let beginning = Beginning { epochs, layer_prefix };
-    Ok((
-        blaze_flow::flow::start_with(options, beginning, supervisor.clone()).await?,
-        log,
-    ))
+    Ok((blaze_flow::flow::start_with(options, beginning, supervisor.clone()).await?, log))
 }
 
-fn node_broker(file: &NodeFile, settings: &FlowSettings, role: &Role) -> anyhow::Result<Option<Arc<dyn Broker>>> {
+fn node_broker(
+    file: &NodeFile,
+    settings: &FlowSettings,
+    role: &Role,
+) -> anyhow::Result<Option<Arc<dyn Broker>>> {
     Ok(match &file.brokers.node {
         None => None,
-        Some(NodeBroker::Memory) => Some(Arc::new(MemoryHub::new(settings.me.to_string()).broker())),
+        Some(NodeBroker::Memory) => {
+            Some(Arc::new(MemoryHub::new(settings.me.to_string()).broker()))
+        }
         Some(section) => Some(open_node(section, role).context("brokers.node")?),
     })
 }
@@ -204,7 +201,8 @@ fn layer_broker(
     Ok((Some(LayerBroker { broker, id }), prefix))
 }
 
-/// What is the same for all processes that share a loopback interface: the boot of the host and the network namespace.
+/// What is the same for all processes that share a loopback interface: the boot of the host and the
+/// network namespace.
 fn this_host() -> String {
     let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     let namespace = std::fs::read_link("/proc/self/ns/net").unwrap_or_default();

@@ -78,7 +78,10 @@ pub(crate) fn on_threads() -> Spawner {
 /// What a node file with these rules in `flow.access` says.
 pub(crate) fn access(rules: &Value) -> AccessRules {
     let file = json!({
-        "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
+        "layer": {
+            "name": "edge",
+            "kind": "edge",
+        }, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
         "flow": {"access": rules},
     });
     NodeFile::read(&file).unwrap().0.flow.access
@@ -86,13 +89,7 @@ pub(crate) fn access(rules: &Value) -> AccessRules {
 
 /// The changes of one version, in one part.
 pub(crate) fn delta(to_version: u64, entries: Vec<Entry>) -> Delta {
-    Delta {
-        from_version: to_version - 1,
-        to_version,
-        part: 0,
-        parts: 1,
-        entries,
-    }
+    Delta { from_version: to_version - 1, to_version, part: 0, parts: 1, entries }
 }
 
 /// What a flow that is ready, and has announced nothing, says in its first life.

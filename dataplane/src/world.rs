@@ -1,6 +1,7 @@
 //! What one flow knows of all flows: the input of the planner.
 //!
-//! The registry builds it from local leases and from what other flows announced; the planner only reads it.
+//! The registry builds it from local leases and from what other flows announced; the planner only
+//! reads it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -36,7 +37,8 @@ pub struct FlowView {
     pub reach: Reach,
     /// Whether it has a node scope.
     pub node_scope: bool,
-    /// The layer broker that it uses: flows of one layer with equal values share it. `None`: it has none.
+    /// The layer broker that it uses: flows of one layer with equal values share it. `None`: it has
+    /// none.
     pub layer_scope: Option<LayerScopeId>,
     /// What its local services advertise and request.
     pub topics: BTreeMap<TopicName, TopicEntry>,
@@ -48,7 +50,8 @@ pub struct FlowView {
     pub gateway: AutoBool,
     /// Whether it is on the inter scope for its group.
     pub role: Role,
-    /// The broker of its layer has not answered it for some seconds: another flow of its group serves that better.
+    /// The broker of its layer has not answered it for some seconds: another flow of its group
+    /// serves that better.
     pub layer_away: bool,
 }
 
@@ -78,8 +81,8 @@ pub enum Role {
     /// It is: flows of other groups reach it.
     #[default]
     Gateway,
-    /// It has been since a moment: what it wrote to the layer scope before is still carried out for it, and what it writes until it
-    /// sends itself.
+    /// It has been since a moment: what it wrote to the layer scope before is still carried out for
+    /// it, and what it writes until it sends itself.
     NewGateway,
     /// It is still, for what is on its way, but has said that it will not be. Of the own flow only.
     Leaving,
@@ -141,10 +144,7 @@ pub struct Handover {
 #[cfg(test)]
 impl<const N: usize> From<[i64; N]> for Handover {
     fn from(offsets: [i64; N]) -> Self {
-        Self {
-            offsets: offsets.into(),
-            to: None,
-        }
+        Self { offsets: offsets.into(), to: None }
     }
 }
 
@@ -171,14 +171,16 @@ impl LayerScopeId {
         Self(rand::random::<u64>().max(1))
     }
 
-    /// Identity of the Kafka broker of a layer: the same for all flows of the layer that give their names this prefix.
+    /// Identity of the Kafka broker of a layer: the same for all flows of the layer that give their
+    /// names this prefix.
     #[must_use]
     pub fn kafka(prefix: &str) -> Self {
         Self::of(&format!("kafka|{prefix}"))
     }
 
-    /// Identity of the DDS domain of a layer: the same for all flows of the layer that use it on its network. A domain on
-    /// loopback is one of this host only, which `host` tells apart from others.
+    /// Identity of the DDS domain of a layer: the same for all flows of the layer that use it on
+    /// its network. A domain on loopback is one of this host only, which `host` tells apart from
+    /// others.
     #[must_use]
     pub fn dds(domain: u16, host: Option<&str>) -> Self {
         match host {
@@ -195,7 +197,8 @@ impl LayerScopeId {
     }
 }
 
-/// What a flow says of itself: it begins, is ready, and goes, never the other way round in one life.
+/// What a flow says of itself: it begins, is ready, and goes, never the other way round in one
+/// life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FlowState {
@@ -236,16 +239,15 @@ pub struct TopicEntry {
     pub node: ScopeEntry,
     /// Services on the layer scope (every flow that shares the layer broker has the same).
     pub layer: ScopeEntry,
-    /// What a gateway says that flows of other groups advertise and request, merged; for flows that are none.
+    /// What a gateway says that flows of other groups advertise and request, merged; for flows that
+    /// are none.
     pub outside: ScopeEntry,
 }
 
 impl TopicEntry {
     /// Whether anybody asks for it.
     pub(crate) fn is_requested(&self) -> bool {
-        [&self.node, &self.layer, &self.outside]
-            .iter()
-            .any(|scope| scope.request.is_some())
+        [&self.node, &self.layer, &self.outside].iter().any(|scope| scope.request.is_some())
     }
 }
 
@@ -258,7 +260,8 @@ pub struct ScopeEntry {
     pub request: Option<Request>,
 }
 
-/// Advertisements of one topic in one scope, merged: sum of rates, largest size, strongest quality of service.
+/// Advertisements of one topic in one scope, merged: sum of rates, largest size, strongest quality
+/// of service.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Advertise {
     /// Sum of the writers' rates; `None` where one of them gives none.
@@ -338,7 +341,9 @@ impl OriginFilter {
     /// Whether an origin passes.
     #[must_use]
     pub fn matches(&self, layer: &str, node: &str, service: &str) -> bool {
-        let part = |wanted: &Option<String>, found: &str| wanted.as_deref().is_none_or(|wanted| wanted == found);
+        let part = |wanted: &Option<String>, found: &str| {
+            wanted.as_deref().is_none_or(|wanted| wanted == found)
+        };
         part(&self.layer, layer) && part(&self.node, node) && part(&self.service, service)
     }
 }
@@ -358,14 +363,20 @@ impl World {
         self.flows.get(&self.me)
     }
 
-    /// Whether a flow carries topics, as far as the own flow knows. Of itself it knows that it lives.
+    /// Whether a flow carries topics, as far as the own flow knows. Of itself it knows that it
+    /// lives.
     pub(crate) fn carries(&self, id: &FlowId) -> bool {
         let flow = self.flows.get(id);
-        flow.is_some_and(|flow| flow.state == FlowState::Ready && (flow.reach != Reach::Down || *id == self.me))
+        flow.is_some_and(|flow| {
+            flow.state == FlowState::Ready && (flow.reach != Reach::Down || *id == self.me)
+        })
     }
 
     /// The flows of one layer, by node.
-    pub fn flows_of<'a>(&'a self, layer: &'a LayerName) -> impl Iterator<Item = (&'a FlowId, &'a FlowView)> {
+    pub fn flows_of<'a>(
+        &'a self,
+        layer: &'a LayerName,
+    ) -> impl Iterator<Item = (&'a FlowId, &'a FlowView)> {
         self.flows.iter().filter(move |(id, _)| id.layer == *layer)
     }
 }

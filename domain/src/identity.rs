@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::names::{LayerName, NameError, NodeName};
 
-/// Identity of one publisher: 16 bytes, random per publisher of an SDK, given by the flow for bare messages.
+/// Identity of one publisher: 16 bytes, random per publisher of an SDK, given by the flow for bare
+/// messages.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
 pub struct WriterId(pub [u8; 16]);
 
@@ -94,10 +95,7 @@ impl FromStr for FlowId {
     type Err = NameError;
     fn from_str(text: &str) -> Result<Self, NameError> {
         let (layer, node) = text.split_once('/').ok_or(NameError::EmptySegment)?;
-        Ok(Self {
-            layer: layer.parse()?,
-            node: node.parse()?,
-        })
+        Ok(Self { layer: layer.parse()?, node: node.parse()? })
     }
 }
 

@@ -1,7 +1,8 @@
 //! The words of BlazeAIoT: names, identities, quality of service, control protocol, drop reasons.
 //!
-//! Everything here is plain data and pure functions: no input or output, no clock, no asynchronous code. Each name is a
-//! type that cannot hold a bad value; each closed set of the contract is an `enum` with its text on the wire.
+//! Everything here is plain data and pure functions: no input or output, no clock, no asynchronous
+//! code. Each name is a type that cannot hold a bad value; each closed set of the contract is an
+//! `enum` with its text on the wire.
 
 pub mod config;
 pub mod control;
@@ -12,7 +13,9 @@ pub mod qos;
 pub mod reasons;
 
 pub use identity::{FlowId, Origin, WriterId};
-pub use names::{DocumentName, InstanceName, LayerName, NameError, NodeName, ServiceName, TopicName};
+pub use names::{
+    DocumentName, InstanceName, LayerName, NameError, NodeName, ServiceName, TopicName,
+};
 pub use qos::{Durability, LayerKind, Priority, Reliability, Scope};
 pub use reasons::{DropReason, WhyCode};
 

@@ -1,6 +1,7 @@
 //! Names of layers, nodes, services, instances and topics.
 //!
-//! A value of one of these types has passed the rules of the contract, so that no later code checks again.
+//! A value of one of these types has passed the rules of the contract, so that no later code checks
+//! again.
 
 use std::fmt;
 use std::str::FromStr;
@@ -53,16 +54,10 @@ fn check_name(text: &str) -> Result<(), NameError> {
         return Err(NameError::Empty);
     }
     if text.len() > MAX_NAME_BYTES {
-        return Err(NameError::TooLong {
-            bytes: text.len(),
-            limit: MAX_NAME_BYTES,
-        });
+        return Err(NameError::TooLong { bytes: text.len(), limit: MAX_NAME_BYTES });
     }
     if let Some(found) = text.chars().find(|c| !matches!(c, 'a'..='z' | '0'..='9' | '-')) {
-        return Err(NameError::Character {
-            found,
-            allowed: "a-z, 0-9 and -",
-        });
+        return Err(NameError::Character { found, allowed: "a-z, 0-9 and -" });
     }
     if text.starts_with('-') || text.ends_with('-') {
         return Err(NameError::Ends);
@@ -75,14 +70,10 @@ fn check_topic_form(text: &str) -> Result<(), NameError> {
         return Err(NameError::Empty);
     }
     if text.len() > MAX_TOPIC_BYTES {
-        return Err(NameError::TooLong {
-            bytes: text.len(),
-            limit: MAX_TOPIC_BYTES,
-        });
+        return Err(NameError::TooLong { bytes: text.len(), limit: MAX_TOPIC_BYTES });
     }
-    if let Some(found) = text
-        .chars()
-        .find(|c| !matches!(c, 'A'..='Z' | 'a'..='z' | '0'..='9' | '_' | '-' | '/'))
+    if let Some(found) =
+        text.chars().find(|c| !matches!(c, 'A'..='Z' | 'a'..='z' | '0'..='9' | '_' | '-' | '/'))
     {
         return Err(NameError::Character {
             found,
@@ -104,7 +95,8 @@ fn check_topic(text: &str) -> Result<(), NameError> {
 }
 
 fn check_channel(text: &str) -> Result<(), NameError> {
-    // `blaze/bare/<topic>` is a channel of its own and may be longer than the topic that it carries.
+    // `blaze/bare/<topic>` is a channel of its own and may be longer than the topic that it
+    // carries.
     match text.strip_prefix("blaze/bare/") {
         Some(topic) => check_topic_form(topic),
         None => check_topic_form(text),
@@ -193,12 +185,13 @@ name!(
     DocumentName, check_name
 );
 name!(
-    /// Name of a user topic: segments of `A-Z a-z 0-9 _ -` joined by `/`, no leading slash, at most 200 bytes, not below
-    /// `blaze/`.
+    /// Name of a user topic: segments of `A-Z a-z 0-9 _ -` joined by `/`, no leading slash, at most
+    /// 200 bytes, not below `blaze/`.
     TopicName, check_topic
 );
 name!(
-    /// Name of a channel of a broker: a user topic, or one of BlazeAIoT's own below `blaze/` (control, events, replies).
+    /// Name of a channel of a broker: a user topic, or one of BlazeAIoT's own below `blaze/`
+    /// (control, events, replies).
     ChannelName, check_channel
 );
 
@@ -253,7 +246,8 @@ impl ChannelName {
         Self(Arc::from(format!("blaze/bare/{topic}")))
     }
 
-    /// Where one life of a service gets its answers, on brokers that make channels as they are named.
+    /// Where one life of a service gets its answers, on brokers that make channels as they are
+    /// named.
     #[must_use]
     pub fn reply(service: &ServiceName, instance: &InstanceName, life: u64) -> Self {
         Self(Arc::from(format!("{REPLY_PREFIX}{service}-{instance}-{life:016x}")))
@@ -265,7 +259,8 @@ impl ChannelName {
         Self(Arc::from(REPLY_PREFIX.trim_end_matches('/')))
     }
 
-    /// Whether the channel is one of BlazeAIoT's own: its payloads are never framed and never bridged.
+    /// Whether the channel is one of BlazeAIoT's own: its payloads are never framed and never
+    /// bridged.
     #[must_use]
     pub fn is_reserved(&self) -> bool {
         self.0.starts_with("blaze/")
@@ -285,13 +280,7 @@ mod tests {
             ("", NameError::Empty),
             ("-a", NameError::Ends),
             ("a-", NameError::Ends),
-            (
-                "Robot",
-                NameError::Character {
-                    found: 'R',
-                    allowed: "a-z, 0-9 and -",
-                },
-            ),
+            ("Robot", NameError::Character { found: 'R', allowed: "a-z, 0-9 and -" }),
             (&"a".repeat(64), NameError::TooLong { bytes: 64, limit: 63 }),
         ] {
             assert_eq!(bad.parse::<NodeName>().unwrap_err(), why, "{bad}");

@@ -1,12 +1,13 @@
 //! Closed sets that describe how a topic is carried.
 
-/// An enum of words: its variants, each with the word that stands for it on the wire and in files. The crate that makes one
-/// needs `serde`.
+/// An enum of words: its variants, each with the word that stands for it on the wire and in files.
+/// The crate that makes one needs `serde`.
 #[macro_export]
 macro_rules! word_enum {
     ($(#[$doc:meta])* $type:ident { $($(#[$variant_doc:meta])* $variant:ident = $text:literal),+ $(,)? }) => {
         $(#[$doc])*
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, ::serde::Serialize, ::serde::Deserialize)]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, ::serde::Serialize,
+            ::serde::Deserialize)]
         pub enum $type {
             $($(#[$variant_doc])* #[serde(rename = $text)] $variant,)+
         }
@@ -31,9 +32,11 @@ macro_rules! word_enum {
         impl ::std::str::FromStr for $type {
             type Err = $crate::qos::UnknownWord;
             fn from_str(text: &str) -> Result<Self, $crate::qos::UnknownWord> {
-                Self::ALL.iter().copied().find(|value| value.as_str() == text).ok_or_else(|| $crate::qos::UnknownWord {
+                Self::ALL.iter().copied().find(|value| value.as_str() == text)
+                    .ok_or_else(|| $crate::qos::UnknownWord {
                     found: text.to_owned(),
-                    allowed: Self::ALL.iter().map(|value| value.as_str()).collect::<Vec<_>>().join(", "),
+                    allowed: Self::ALL.iter().map(|value| value.as_str()).collect::<Vec<_>>()
+                        .join(", "),
                 })
             }
         }
@@ -76,7 +79,8 @@ word_enum!(
 );
 
 word_enum!(
-    /// Class of a topic on the inter scope; the smaller value goes first (`Control < State < Bulk`).
+    /// Class of a topic on the inter scope; the smaller value goes first (`Control < State <
+    /// Bulk`).
     Priority {
         /// Commands: before everything else.
         Control = "control",

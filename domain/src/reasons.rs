@@ -1,4 +1,5 @@
-//! Why a message was dropped, and why a topic does or does not arrive. Both sets are part of the contract.
+//! Why a message was dropped, and why a topic does or does not arrive. Both sets are part of the
+//! contract.
 
 use crate::qos::word_enum;
 

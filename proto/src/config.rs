@@ -4,8 +4,8 @@
 //! blaze_domain::config::{Key, Document, Timestamp, Kind} ◄──► v1::{Ref, Document, Kind}, google::Timestamp
 //! ```
 //!
-//! What comes in is checked here for its form only (names, JSON, known kinds); whether a document makes sense is for
-//! those who keep it.
+//! What comes in is checked here for its form only (names, JSON, known kinds); whether a document
+//! makes sense is for those who keep it.
 
 use std::sync::Arc;
 
@@ -76,9 +76,7 @@ impl From<&Key> for v1::Ref {
         Self {
             kind: v1::Kind::from(key.kind()).into(),
             name: key.name().as_str().to_owned(),
-            service: key
-                .service_name()
-                .map_or_else(String::new, |name| name.as_str().to_owned()),
+            service: key.service_name().map_or_else(String::new, |name| name.as_str().to_owned()),
         }
     }
 }
@@ -106,8 +104,8 @@ pub fn timestamp_to_wire(time: Timestamp) -> google::Timestamp {
     }
 }
 
-/// A time that came, cut to milliseconds; one that is not given is the beginning of 1970, one that is out of range the
-/// nearest that is not.
+/// A time that came, cut to milliseconds; one that is not given is the beginning of 1970, one that
+/// is out of range the nearest that is not.
 #[must_use]
 pub fn timestamp_from_wire(wire: Option<&google::Timestamp>) -> Timestamp {
     let Some(wire) = wire else {
@@ -156,7 +154,8 @@ impl TryFrom<v1::Document> for Document {
     }
 }
 
-/// JSON in a member of a message, read as strictly as a request of REST; empty text is an empty object.
+/// JSON in a member of a message, read as strictly as a request of REST; empty text is an empty
+/// object.
 ///
 /// # Errors
 /// [`WireError::Json`].
@@ -168,10 +167,8 @@ pub fn object_from_wire(member: &'static str, text: &str) -> Result<Value, WireE
 }
 
 fn parse(member: &'static str, text: &str) -> Result<Value, WireError> {
-    json::parse(text.as_bytes()).map_err(|error| WireError::Json {
-        member,
-        detail: error.to_string(),
-    })
+    json::parse(text.as_bytes())
+        .map_err(|error| WireError::Json { member, detail: error.to_string() })
 }
 
 #[cfg(test)]
@@ -231,11 +228,7 @@ mod tests {
     }
 
     fn reference(kind: i32, service: &str, name: &str) -> v1::Ref {
-        v1::Ref {
-            kind,
-            name: name.into(),
-            service: service.into(),
-        }
+        v1::Ref { kind, name: name.into(), service: service.into() }
     }
 
     #[test]
@@ -283,11 +276,7 @@ mod tests {
             .map(google::ServiceDescriptorProto::name)
             .collect();
         assert_eq!(services, ["ConfigService", "SyncService"]);
-        assert!(
-            set.file
-                .iter()
-                .any(|file| file.name() == "google/protobuf/timestamp.proto")
-        );
+        assert!(set.file.iter().any(|file| file.name() == "google/protobuf/timestamp.proto"));
         assert!(!set.file.iter().any(|file| file.name().contains("control.proto")));
     }
 }

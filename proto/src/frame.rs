@@ -4,9 +4,10 @@
 //! "BLZ1" | u32 little-endian header length (at most 4096) | header (protobuf) | payload (at most 16 MiB)
 //! ```
 //!
-//! [`Frame::parse`] looks at the header once, without an allocation: texts stay where they are and are found by their
-//! place. Hops and age change on the way; [`Frame::with_hops_and_age`] notes them beside the bytes, and only a writer
-//! that puts the frame on a broker encodes them ([`Frame::head_to_write`]). The payload is never copied here.
+//! [`Frame::parse`] looks at the header once, without an allocation: texts stay where they are and
+//! are found by their place. Hops and age change on the way; [`Frame::with_hops_and_age`] notes
+//! them beside the bytes, and only a writer that puts the frame on a broker encodes them
+//! ([`Frame::head_to_write`]). The payload is never copied here.
 
 mod compressed;
 mod header;
@@ -91,7 +92,8 @@ impl Frame {
     /// Encodes a header for a payload.
     ///
     /// # Errors
-    /// [`FrameError::HeaderTooLarge`], [`FrameError::PayloadTooLarge`], or [`FrameError::Field`] for a sequence of 0.
+    /// [`FrameError::HeaderTooLarge`], [`FrameError::PayloadTooLarge`], or [`FrameError::Field`]
+    /// for a sequence of 0.
     pub fn new(header: &Header, payload: Bytes) -> Result<Self, FrameError> {
         let wire = header.to_wire();
         let length = wire.encoded_len();
@@ -101,8 +103,7 @@ impl Frame {
         let mut head = BytesMut::with_capacity(PREFIX_BYTES + length);
         head.put_slice(&MAGIC);
         head.put_u32_le(u32::try_from(length).map_err(|_| FrameError::HeaderTooLarge(length))?);
-        wire.encode(&mut head)
-            .map_err(|error| FrameError::Header(error.to_string()))?;
+        wire.encode(&mut head).map_err(|error| FrameError::Header(error.to_string()))?;
         Self::from_parts(head.freeze(), payload)
     }
 
@@ -113,10 +114,7 @@ impl Frame {
     pub fn parse(mut whole: Bytes) -> Result<Self, FrameError> {
         let head_bytes = Self::head_length(&whole)?;
         if whole.len() < head_bytes {
-            return Err(FrameError::Truncated {
-                found: whole.len(),
-                needed: head_bytes,
-            });
+            return Err(FrameError::Truncated { found: whole.len(), needed: head_bytes });
         }
         let head = whole.split_to(head_bytes);
         Self::from_parts(head, whole)
@@ -131,10 +129,7 @@ impl Frame {
             return Err(FrameError::Magic);
         }
         let Some(length) = bytes.get(4..PREFIX_BYTES) else {
-            return Err(FrameError::Truncated {
-                found: bytes.len(),
-                needed: PREFIX_BYTES,
-            });
+            return Err(FrameError::Truncated { found: bytes.len(), needed: PREFIX_BYTES });
         };
         let length = u32::from_le_bytes([length[0], length[1], length[2], length[3]]) as usize;
         if length > MAX_HEADER_BYTES {
@@ -150,23 +145,14 @@ impl Frame {
     pub fn from_parts(head: Bytes, payload: Bytes) -> Result<Self, FrameError> {
         let needed = Self::head_length(&head)?;
         if head.len() != needed {
-            return Err(FrameError::Truncated {
-                found: head.len(),
-                needed,
-            });
+            return Err(FrameError::Truncated { found: head.len(), needed });
         }
         if payload.len() > MAX_PAYLOAD_BYTES {
             return Err(FrameError::PayloadTooLarge(payload.len()));
         }
         let index = Index::read(&head[PREFIX_BYTES..])?;
         let (hops, age_us) = (index.encoded_hops, index.encoded_age_us);
-        Ok(Self {
-            head,
-            payload,
-            index,
-            hops,
-            age_us,
-        })
+        Ok(Self { head, payload, index, hops, age_us })
     }
 
     /// The same message with other hops and age.
@@ -183,7 +169,8 @@ impl Frame {
         &self.head
     }
 
-    /// Prefix and header with today's hops and age: what a writer to a broker sends before the payload.
+    /// Prefix and header with today's hops and age: what a writer to a broker sends before the
+    /// payload.
     #[must_use]
     pub fn head_to_write(&self) -> Bytes {
         let index = &self.index;
@@ -240,7 +227,8 @@ impl Frame {
     fn text(&self, place: &Range<u16>) -> &str {
         let place = usize_range(place);
         // `Index::read` has checked that these bytes are UTF-8.
-        std::str::from_utf8(&self.head[PREFIX_BYTES + place.start..PREFIX_BYTES + place.end]).unwrap_or_default()
+        std::str::from_utf8(&self.head[PREFIX_BYTES + place.start..PREFIX_BYTES + place.end])
+            .unwrap_or_default()
     }
 
     /// Topic.

@@ -3,7 +3,8 @@
 //! - [`frame`]: a message on a broker: `BLZ1`, header length, header, payload;
 //! - [`v1`]: the message header as generated from `blaze/v1/message.proto`;
 //! - [`link`]: what flows tell one another, generated from `blaze/link/v1/control.proto`;
-//! - with feature `config`, `v1` has the configuration's services too, and `config` turns their messages into documents.
+//! - with feature `config`, `v1` has the configuration's services too, and `config` turns their
+//!   messages into documents.
 
 #[cfg(feature = "config")]
 pub mod config;
@@ -17,11 +18,13 @@ pub use prost::Message;
 #[cfg(feature = "config")]
 pub use prost_types as google;
 
-/// Descriptors (`google.protobuf.FileDescriptorSet`) of the configuration's services and their messages, for reflection.
+/// Descriptors (`google.protobuf.FileDescriptorSet`) of the configuration's services and their
+/// messages, for reflection.
 #[cfg(feature = "config")]
 pub const CONFIG_DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/blaze.config.bin"));
 
-/// Generated from `blaze/v1/message.proto`; with feature `config` from `config.proto` and `sync.proto` beside it too.
+/// Generated from `blaze/v1/message.proto`; with feature `config` from `config.proto` and
+/// `sync.proto` beside it too.
 #[allow(missing_docs, clippy::all, clippy::pedantic, reason = "generated code")]
 pub mod v1 {
     include!(concat!(env!("OUT_DIR"), "/blaze.v1.rs"));
@@ -35,14 +38,12 @@ pub mod link {
 
 impl From<link::link_control::Body> for link::LinkControl {
     fn from(body: link::link_control::Body) -> Self {
-        Self {
-            body: Some(body),
-            channel: None,
-        }
+        Self { body: Some(body), channel: None }
     }
 }
 
-/// A priority as it travels; [`Priority::State`](blaze_domain::Priority::State) for one that is not given.
+/// A priority as it travels; [`Priority::State`](blaze_domain::Priority::State) for one that is not
+/// given.
 #[must_use]
 pub fn priority_from_wire(value: i32) -> blaze_domain::Priority {
     match value {

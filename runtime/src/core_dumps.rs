@@ -9,7 +9,8 @@ use crate::environment;
 /// Set to anything, it leaves core dumps as the system makes them, for those who look for a fault.
 const VARIABLE: &str = "BLAZE_CORE_DUMPS";
 
-/// From now on the system writes no core dump of this process, and only root can look into its memory.
+/// From now on the system writes no core dump of this process, and only root can look into its
+/// memory.
 ///
 /// # Errors
 /// When the system refuses. It does not for any known reason.

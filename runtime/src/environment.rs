@@ -34,10 +34,8 @@ pub fn variables(prefix: &str) -> Vec<(String, String)> {
     let text = |(name, value): (std::ffi::OsString, std::ffi::OsString)| {
         Some((name.into_string().ok()?, value.into_string().ok()?))
     };
-    let mut found: Vec<_> = std::env::vars_os()
-        .filter_map(text)
-        .filter(|(name, _)| name.starts_with(prefix))
-        .collect();
+    let mut found: Vec<_> =
+        std::env::vars_os().filter_map(text).filter(|(name, _)| name.starts_with(prefix)).collect();
     found.sort();
     found
 }

@@ -1,5 +1,5 @@
-//! What every process of BlazeAIoT needs and no domain logic: configuration, supervised tasks, an orderly shutdown,
-//! logs, the admin port, small state on disk.
+//! What every process of BlazeAIoT needs and no domain logic: configuration, supervised tasks, an
+//! orderly shutdown, logs, the admin port, small state on disk.
 //!
 //! ```text
 //! main: config ▶ logs ▶ Supervisor ▶ AdminServer ▶ (the program's parts) ▶ ready_line ▶ Supervisor::run ▶ exit code
@@ -18,6 +18,6 @@ pub use admin::{AdminServer, CheckStatus, Gate, Readiness};
 pub use core_dumps::forbid_core_dumps;
 pub use ready::ready_line;
 pub use supervisor::{
-    ShutdownPhase, ShutdownReport, ShutdownSteps, Signals, StopOnDrop, Supervisor, TaskEnd, TaskHandle, TaskInfo,
-    TaskPolicy, block_on, exit_code, say,
+    ShutdownPhase, ShutdownReport, ShutdownSteps, Signals, StopOnDrop, Supervisor, TaskEnd,
+    TaskHandle, TaskInfo, TaskPolicy, block_on, exit_code, say,
 };

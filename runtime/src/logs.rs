@@ -22,7 +22,10 @@ pub enum LogFormat {
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
     /// The text is no level and no directives.
-    #[error("{origin}: {text:?} is neither a level nor directives such as info,blaze_flow=debug: {detail}")]
+    #[error(
+        "{origin}: {text:?} is neither a level nor directives such as info,blaze_flow=debug: \
+         {detail}"
+    )]
     Level {
         /// Where the text comes from.
         origin: &'static str,
@@ -48,7 +51,8 @@ pub struct LogHandle {
 }
 
 impl LogHandle {
-    /// Sets the level that the configuration gives; without effect where `RUST_LOG` is set. Answers whether it has one.
+    /// Sets the level that the configuration gives; without effect where `RUST_LOG` is set. Answers
+    /// whether it has one.
     ///
     /// # Errors
     /// If the text is neither a level nor directives; the old level stays.
@@ -64,9 +68,7 @@ impl LogHandle {
 
 impl std::fmt::Debug for LogHandle {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("LogHandle")
-            .field("fixed", &self.fixed)
-            .finish_non_exhaustive()
+        f.debug_struct("LogHandle").field("fixed", &self.fixed).finish_non_exhaustive()
     }
 }
 
@@ -77,8 +79,10 @@ impl std::fmt::Debug for LogHandle {
 pub fn init(level: &str, format: LogFormat) -> Result<LogHandle, LogError> {
     let colours = std::io::stderr().is_terminal() && environment::variable("NO_COLOR").is_none();
     let from_environment = environment::variable("RUST_LOG");
-    let (subscriber, handle) = build(level, from_environment.as_deref(), format, colours, std::io::stderr)?;
-    tracing::subscriber::set_global_default(subscriber).map_err(|_| LogError::AlreadyInitialised)?;
+    let (subscriber, handle) =
+        build(level, from_environment.as_deref(), format, colours, std::io::stderr)?;
+    tracing::subscriber::set_global_default(subscriber)
+        .map_err(|_| LogError::AlreadyInitialised)?;
     Ok(handle)
 }
 
@@ -118,22 +122,18 @@ where
         LogFormat::Text => lines.boxed(),
         LogFormat::Json => lines.json().flatten_event(true).boxed(),
     };
-    let handle = LogHandle {
-        filter: handle,
-        fixed: from_environment.is_some(),
-    };
+    let handle = LogHandle { filter: handle, fixed: from_environment.is_some() };
     Ok((Registry::default().with(filter).with(lines), handle))
 }
 
 fn filter(origin: &'static str, text: &str) -> Result<EnvFilter, LogError> {
     let bare = ["off", "error", "warn", "info", "debug", "trace"];
-    // EnvFilter takes a word that is no level for the name of a module: a slip would silence everything.
-    let known = |part: &str| part.contains(['=', '[']) || bare.contains(&part.to_ascii_lowercase().as_str());
-    let wrong = |detail: String| LogError::Level {
-        origin,
-        text: text.to_owned(),
-        detail,
+    // EnvFilter takes a word that is no level for the name of a module: a slip would silence
+    // everything.
+    let known = |part: &str| {
+        part.contains(['=', '[']) || bare.contains(&part.to_ascii_lowercase().as_str())
     };
+    let wrong = |detail: String| LogError::Level { origin, text: text.to_owned(), detail };
     if let Some(part) = text.split(',').map(str::trim).find(|part| !known(part)) {
         return Err(wrong(format!("{part:?} is no level")));
     }
@@ -168,10 +168,16 @@ mod tests {
         }
     }
 
-    fn logs(level: &str, environment: Option<&str>, format: LogFormat, act: impl FnOnce(&LogHandle, &Lines)) {
+    fn logs(
+        level: &str,
+        environment: Option<&str>,
+        format: LogFormat,
+        act: impl FnOnce(&LogHandle, &Lines),
+    ) {
         let lines = Lines::default();
         let writer = lines.clone();
-        let (subscriber, handle) = build(level, environment, format, false, move || writer.clone()).unwrap();
+        let (subscriber, handle) =
+            build(level, environment, format, false, move || writer.clone()).unwrap();
         tracing::subscriber::with_default(subscriber, || act(&handle, &lines));
     }
 
@@ -209,10 +215,8 @@ mod tests {
 
     #[test]
     fn wrong_levels_say_where_they_come_from() {
-        let error = build("loud", None, LogFormat::Text, false, std::io::sink)
-            .err()
-            .unwrap()
-            .to_string();
+        let error =
+            build("loud", None, LogFormat::Text, false, std::io::sink).err().unwrap().to_string();
         assert!(error.starts_with("log.level: \"loud\""), "{error}");
         let error = build("info", Some("a=loud"), LogFormat::Text, false, std::io::sink)
             .err()

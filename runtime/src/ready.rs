@@ -30,7 +30,8 @@ mod tests {
     fn the_line_reads_as_documented() {
         let mut out = Vec::new();
         let admin = "127.0.0.1:9104".parse().unwrap();
-        write_ready_line(&mut out, &[("admin", admin), ("rest", "[::1]:8080".parse().unwrap())]).unwrap();
+        write_ready_line(&mut out, &[("admin", admin), ("rest", "[::1]:8080".parse().unwrap())])
+            .unwrap();
         assert_eq!(out, b"ready admin=127.0.0.1:9104 rest=[::1]:8080\n");
     }
 }

@@ -1,4 +1,5 @@
-//! Small files that outlive the process: where they lie, how they are written whole or not at all, and epochs.
+//! Small files that outlive the process: where they lie, how they are written whole or not at all,
+//! and epochs.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
@@ -24,8 +25,8 @@ pub struct StateDirectory {
     pub instead_of: Option<String>,
 }
 
-/// The configured directory (default `/var/lib/blaze`), or without rights there `$XDG_STATE_HOME/blaze`, or
-/// `~/.local/state/blaze`. It is made if it does not exist.
+/// The configured directory (default `/var/lib/blaze`), or without rights there
+/// `$XDG_STATE_HOME/blaze`, or `~/.local/state/blaze`. It is made if it does not exist.
 ///
 /// # Errors
 /// If none of them can be written to; the text names each with its reason.
@@ -33,7 +34,8 @@ pub fn state_directory(configured: Option<&Path>) -> io::Result<StateDirectory> 
     let user = environment::variable("XDG_STATE_HOME")
         .map(PathBuf::from)
         .filter(|path| path.is_absolute());
-    let home = || environment::variable("HOME").map(|home| PathBuf::from(home).join(".local/state"));
+    let home =
+        || environment::variable("HOME").map(|home| PathBuf::from(home).join(".local/state"));
     resolve(
         configured.unwrap_or(Path::new(DEFAULT_DIRECTORY)),
         user.or_else(home).map(|state| state.join("blaze")),
@@ -43,10 +45,7 @@ pub fn state_directory(configured: Option<&Path>) -> io::Result<StateDirectory> 
 fn resolve(wanted: &Path, fallback: Option<PathBuf>) -> io::Result<StateDirectory> {
     let refused = match probe(wanted) {
         Ok(()) => {
-            return Ok(StateDirectory {
-                path: wanted.to_owned(),
-                instead_of: None,
-            });
+            return Ok(StateDirectory { path: wanted.to_owned(), instead_of: None });
         }
         Err(error) => format!("{}: {error}", wanted.display()),
     };
@@ -56,10 +55,7 @@ fn resolve(wanted: &Path, fallback: Option<PathBuf>) -> io::Result<StateDirector
         )));
     };
     match probe(&path) {
-        Ok(()) => Ok(StateDirectory {
-            path,
-            instead_of: Some(refused),
-        }),
+        Ok(()) => Ok(StateDirectory { path, instead_of: Some(refused) }),
         Err(error) => Err(io::Error::other(format!(
             "no directory for state: {refused}; {}: {error}",
             path.display()
@@ -73,8 +69,8 @@ fn probe(directory: &Path) -> io::Result<()> {
     NamedTempFile::new_in(directory)?.close()
 }
 
-/// Replaces a small file in one step: a reader, and a machine that loses power, sees the old or the new content.
-/// Only the owner may read it.
+/// Replaces a small file in one step: a reader, and a machine that loses power, sees the old or the
+/// new content. Only the owner may read it.
 ///
 /// # Errors
 /// Those of the file system; the old content is then still there.
@@ -108,16 +104,14 @@ pub fn read_small(path: &Path) -> io::Result<Option<Vec<u8>>> {
     Ok(Some(content))
 }
 
-/// The next epoch of the flow of a node: max(milliseconds since 1970, stored + 1), so that it grows although the clock
-/// may stand still or go back. Kept in `flow-epoch.<layer>.<node>`; two processes never get the same one.
+/// The next epoch of the flow of a node: max(milliseconds since 1970, stored + 1), so that it grows
+/// although the clock may stand still or go back. Kept in `flow-epoch.<layer>.<node>`; two
+/// processes never get the same one.
 ///
 /// # Errors
 /// Those of the file system, and one for names that cannot be part of a file name.
 pub fn next_epoch(directory: &Path, layer: &str, node: &str) -> io::Result<u64> {
-    let now = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default()
-        .as_millis();
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
     next_epoch_at(directory, layer, node, u64::try_from(now).unwrap_or(u64::MAX))
 }
 
@@ -142,7 +136,10 @@ fn next_epoch_at(directory: &Path, layer: &str, node: &str, now_ms: u64) -> io::
     let stored = match read_small(&path)? {
         None => 0,
         Some(content) => parse_epoch(&content).unwrap_or_else(|| {
-            tracing::warn!(path = %path.display(), "the stored epoch cannot be read and is taken from the clock");
+            tracing::warn!(
+                path = %path.display(),
+                "the stored epoch cannot be read and is taken from the clock",
+            );
             0
         }),
     };
@@ -213,11 +210,8 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path();
         let mut epochs: Vec<u64> = std::thread::scope(|scope| {
-            let take = || {
-                (0..20)
-                    .map(|_| next_epoch_at(path, "l", "n", 1).unwrap())
-                    .collect::<Vec<_>>()
-            };
+            let take =
+                || (0..20).map(|_| next_epoch_at(path, "l", "n", 1).unwrap()).collect::<Vec<_>>();
             let threads: Vec<_> = (0..4).map(|_| scope.spawn(take)).collect();
             threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect()
         });

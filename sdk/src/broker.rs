@@ -22,11 +22,16 @@ impl LocalBroker {
         Self { shared }
     }
 
-    /// A publisher for a topic, with an identity of its own. The broker may be away: messages are dropped until it is back.
+    /// A publisher for a topic, with an identity of its own. The broker may be away: messages are
+    /// dropped until it is back.
     ///
     /// # Errors
     /// [`SdkError::Option`] or [`SdkError::Broker`], when the broker cannot carry the topic.
-    pub fn publisher(&self, topic: &TopicName, options: &PublishOptions) -> Result<Publisher, SdkError> {
+    pub fn publisher(
+        &self,
+        topic: &TopicName,
+        options: &PublishOptions,
+    ) -> Result<Publisher, SdkError> {
         options.check()?;
         self.shared.refuse_when_stopping()?;
         let to = self.shared.broker.publisher(
@@ -40,10 +45,11 @@ impl LocalBroker {
         Ok(Publisher::new(topic, self.shared.identity.origin(), options, to))
     }
 
-    /// Calls back for each message of a topic that is published from now on, on the service's pool of threads. Messages of
-    /// one writer come one at a time and in order (unless `concurrency` says otherwise); those of different writers may come
-    /// at the same time. A slow callback holds up neither other writers nor other subscriptions. A callback that panics is
-    /// counted and logged, and the next message comes.
+    /// Calls back for each message of a topic that is published from now on, on the service's pool
+    /// of threads. Messages of one writer come one at a time and in order (unless `concurrency`
+    /// says otherwise); those of different writers may come at the same time. A slow callback holds
+    /// up neither other writers nor other subscriptions. A callback that panics is counted and
+    /// logged, and the next message comes.
     ///
     /// # Errors
     /// [`SdkError::Option`], or [`SdkError::Broker`] when it cannot be subscribed now.
@@ -58,18 +64,9 @@ impl LocalBroker {
     {
         options.check()?;
         self.shared.refuse_when_stopping()?;
-        let source = self
-            .shared
-            .broker
-            .subscribe(&ChannelName::from(topic), options.of_the_port())
-            .await?;
-        Ok(subscription::start(
-            &self.shared,
-            topic,
-            options,
-            source,
-            Box::new(callback),
-        ))
+        let source =
+            self.shared.broker.subscribe(&ChannelName::from(topic), options.of_the_port()).await?;
+        Ok(subscription::start(&self.shared, topic, options, source, Box::new(callback)))
     }
 
     /// Whether the broker answers, and its changes.

@@ -60,15 +60,16 @@ mod subscription;
 pub use blaze_brokers::PublishOutcome;
 pub use broker::LocalBroker;
 pub use cache::{
-    CacheError, CacheManager, Liveness, MAX_CACHE_KEY_BYTES, MAX_CACHE_TIME, MAX_CACHE_VALUE_BYTES, ServiceState,
+    CacheError, CacheManager, Liveness, MAX_CACHE_KEY_BYTES, MAX_CACHE_TIME, MAX_CACHE_VALUE_BYTES,
+    ServiceState,
 };
 pub use config::{
-    AckStatus, BaseConfiguration, BaseSource, ConfigChange, ConfigCounts, ConfigError, ConfigListener, ConfigManager,
-    ConfigScope, ConfigSource, ProgramConfig,
+    AckStatus, BaseConfiguration, BaseSource, ConfigChange, ConfigCounts, ConfigError,
+    ConfigListener, ConfigManager, ConfigScope, ConfigSource, ProgramConfig,
 };
 pub use flow::{
-    Advertise, FlowError, FlowEvent, FlowEventKind, FlowEvents, FlowManager, Lease, LeaseState, OriginFilter,
-    RefusalCode, Request,
+    Advertise, FlowError, FlowEvent, FlowEventKind, FlowEvents, FlowManager, Lease, LeaseState,
+    OriginFilter, RefusalCode, Request,
 };
 pub use message::Message;
 pub use options::ServiceOptions;

@@ -21,10 +21,7 @@ pub struct Message {
 #[derive(Debug, Clone)]
 enum Body {
     Framed(Frame),
-    Bare {
-        payload: Bytes,
-        identity: Option<(WriterId, u64)>,
-    },
+    Bare { payload: Bytes, identity: Option<(WriterId, u64)> },
 }
 
 impl Message {
@@ -93,15 +90,16 @@ impl Message {
         }
     }
 
-    /// When it was published, by the clock of the publisher's machine. For display: clocks differ; use
-    /// [`Message::age`] to judge how old it is.
+    /// When it was published, by the clock of the publisher's machine. For display: clocks differ;
+    /// use [`Message::age`] to judge how old it is.
     #[must_use]
     pub fn publish_time(&self) -> Option<SystemTime> {
         let since_epoch = Duration::from_nanos(self.frame()?.publish_time_ns());
         SystemTime::UNIX_EPOCH.checked_add(since_epoch)
     }
 
-    /// How long ago it was published: what the flows on the way measured, and the time since it arrived here.
+    /// How long ago it was published: what the flows on the way measured, and the time since it
+    /// arrived here.
     #[must_use]
     pub fn age(&self) -> Duration {
         self.age_at(Instant::now(), SystemTime::now())
@@ -112,10 +110,10 @@ impl Message {
         let measured = on_the_way
             .saturating_add(self.broker_age)
             .saturating_add(now.saturating_duration_since(self.received_at));
-        // On one node publisher and subscriber share a clock, and no flow measured what came directly.
-        let of_this_node = (self.scope == Scope::Node && self.hops() == 0)
-            .then(|| self.publish_time())
-            .flatten();
+        // On one node publisher and subscriber share a clock, and no flow measured what came
+        // directly.
+        let of_this_node =
+            (self.scope == Scope::Node && self.hops() == 0).then(|| self.publish_time()).flatten();
         let by_clock = of_this_node.and_then(|published| wall.duration_since(published).ok());
         measured.max(by_clock.unwrap_or_default())
     }

@@ -31,7 +31,8 @@ pub struct ServiceOptions {
     pub broker: Arc<dyn Broker>,
     /// How far that broker reaches.
     pub scope: Scope,
-    /// Threads for callbacks; 0 = as many as the process may use cores (cgroups count). At least two are started.
+    /// Threads for callbacks; 0 = as many as the process may use cores (cgroups count). At least
+    /// two are started.
     pub pool_threads: usize,
     /// Time to live of the service's leases, 1 s to 1 day; they are renewed at a third of it.
     pub lease_ttl: Duration,
@@ -39,12 +40,13 @@ pub struct ServiceOptions {
     pub control_timeout: Duration,
     /// Larger is newer; 0 = milliseconds since 1970 at the start.
     pub epoch: u64,
-    /// The service's tasks and threads run under a child of it: their failure is its failure, and its shutdown ends them,
-    /// though without withdrawing leases; for that call [`ServiceManager::shutdown`](crate::ServiceManager::shutdown) before. Absent = under a supervisor of
-    /// their own, whose failure is logged.
+    /// The service's tasks and threads run under a child of it: their failure is its failure, and
+    /// its shutdown ends them, though without withdrawing leases; for that call
+    /// [`ServiceManager::shutdown`](crate::ServiceManager::shutdown) before. Absent = under a
+    /// supervisor of their own, whose failure is logged.
     pub supervisor: Option<Supervisor>,
-    /// Redis in which the service keeps values and says that it lives (`cache.redis` of the node file). Without one it says so
-    /// by messages.
+    /// Redis in which the service keeps values and says that it lives (`cache.redis` of the node
+    /// file). Without one it says so by messages.
     pub cache: Option<RedisBroker>,
     /// How long a sign of life counts, 1 s to 1 h; it is given every third of it.
     pub watchdog_ttl: Duration,
@@ -57,10 +59,15 @@ pub struct ServiceOptions {
 }
 
 impl ServiceOptions {
-    /// A service on no particular node, with the default bounds: the instance that the variable `BLAZE_INSTANCE` names, else the first
-    /// one.
+    /// A service on no particular node, with the default bounds: the instance that the variable
+    /// `BLAZE_INSTANCE` names, else the first one.
     #[must_use]
-    pub fn new(layer: LayerName, service: ServiceName, broker: Arc<dyn Broker>, scope: Scope) -> Self {
+    pub fn new(
+        layer: LayerName,
+        service: ServiceName,
+        broker: Arc<dyn Broker>,
+        scope: Scope,
+    ) -> Self {
         Self {
             layer,
             node: None,
@@ -81,7 +88,8 @@ impl ServiceOptions {
         }
     }
 
-    /// Whether the environment names an instance that can be none, and nobody has chosen another one.
+    /// Whether the environment names an instance that can be none, and nobody has chosen another
+    /// one.
     pub(crate) fn check_instance(&self) -> Result<(), SdkError> {
         match of_environment() {
             Err(error) if self.instance == InstanceName::first() => Err(error),
@@ -103,7 +111,9 @@ impl ServiceOptions {
         if self.version.len() > MAX_VERSION_BYTES || self.version.chars().any(char::is_control) {
             return Err(SdkError::Option {
                 option: "version",
-                reason: format!("must have at most {MAX_VERSION_BYTES} bytes and no control characters"),
+                reason: format!(
+                    "must have at most {MAX_VERSION_BYTES} bytes and no control characters"
+                ),
             });
         }
         Ok(())
@@ -148,35 +158,17 @@ mod tests {
         assert_eq!(named(None).unwrap(), None);
         assert_eq!(named(Some("left")).unwrap(), Some("left".parse().unwrap()));
         let error = named(Some("Left!")).unwrap_err();
-        assert!(
-            matches!(
-                error,
-                SdkError::Option {
-                    option: "BLAZE_INSTANCE",
-                    ..
-                }
-            ),
-            "{error}"
-        );
+        assert!(matches!(error, SdkError::Option { option: "BLAZE_INSTANCE", .. }), "{error}");
     }
 
     #[tokio::test]
     async fn options_that_cannot_be_are_named() {
         for (bad, option) in [
             (
-                ServiceOptions {
-                    watchdog_ttl: Duration::from_millis(999),
-                    ..options()
-                },
+                ServiceOptions { watchdog_ttl: Duration::from_millis(999), ..options() },
                 "watchdog_ttl",
             ),
-            (
-                ServiceOptions {
-                    version: "1\n2".to_owned(),
-                    ..options()
-                },
-                "version",
-            ),
+            (ServiceOptions { version: "1\n2".to_owned(), ..options() }, "version"),
         ] {
             let error = ServiceManager::start(bad).await.err().unwrap();
             assert!(
@@ -199,7 +191,8 @@ mod tests {
             tokio::time::sleep(Duration::from_secs(5)).await;
             parent.stopping_token().cancel();
         };
-        let (result, ()) = tokio::join!(tokio::time::timeout(Duration::from_secs(60), waits), stops);
+        let (result, ()) =
+            tokio::join!(tokio::time::timeout(Duration::from_secs(60), waits), stops);
         assert!(matches!(result.unwrap(), Err(SdkError::ShutDown)));
     }
 }

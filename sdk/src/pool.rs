@@ -5,9 +5,10 @@
 //!                                         └──► spare threads, while callbacks keep all others busy
 //! ```
 //!
-//! A ticket is "this subscription has something to run"; its job runs one callback and is put back at the end of the queue
-//! if there is more, so subscriptions take turns. When nothing was taken from the queue for [`STUCK_AFTER`], because every
-//! thread sits in a callback that waits for something, a spare thread comes to help; it leaves when it has been idle.
+//! A ticket is "this subscription has something to run"; its job runs one callback and is put back
+//! at the end of the queue if there is more, so subscriptions take turns. When nothing was taken
+//! from the queue for [`STUCK_AFTER`], because every thread sits in a callback that waits for
+//! something, a spare thread comes to help; it leaves when it has been idle.
 
 use std::collections::VecDeque;
 use std::io;
@@ -64,8 +65,8 @@ struct State {
 }
 
 impl Pool {
-    /// Starts the threads; at least two, so that one slow callback never holds up the others. They end with the supervisor,
-    /// after the callback that they are in.
+    /// Starts the threads; at least two, so that one slow callback never holds up the others. They
+    /// end with the supervisor, after the callback that they are in.
     pub(crate) fn start(threads: usize, supervisor: &Supervisor) -> io::Result<Self> {
         let pool = Self {
             shared: Arc::new(Shared {
@@ -76,8 +77,7 @@ impl Pool {
             }),
         };
         for number in 0..threads.max(2) {
-            pool.shared
-                .spawn(format!("blaze-cb-{number}"), |shared| work(shared, None))?;
+            pool.shared.spawn(format!("blaze-cb-{number}"), |shared| work(shared, None))?;
         }
         pool.shared.spawn("blaze-cb-watch".to_owned(), help_when_stuck)?;
         let (shared, stop) = (Arc::clone(&pool.shared), supervisor.shutdown_token());
@@ -89,9 +89,7 @@ impl Pool {
     }
 
     pub(crate) fn handle(&self) -> PoolHandle {
-        PoolHandle {
-            shared: Arc::clone(&self.shared),
-        }
+        PoolHandle { shared: Arc::clone(&self.shared) }
     }
 
     /// Forgets what waits and tells the threads to end after the callback that they are in.
@@ -138,10 +136,13 @@ impl Shared {
         }
     }
 
-    fn spawn(self: &Arc<Self>, name: String, body: impl FnOnce(&Arc<Self>) + Send + 'static) -> io::Result<()> {
+    fn spawn(
+        self: &Arc<Self>,
+        name: String,
+        body: impl FnOnce(&Arc<Self>) + Send + 'static,
+    ) -> io::Result<()> {
         let shared = Arc::clone(self);
-        self.supervisor
-            .spawn_thread(name, TaskPolicy::MayEnd, move || body(&shared))?;
+        self.supervisor.spawn_thread(name, TaskPolicy::MayEnd, move || body(&shared))?;
         Ok(())
     }
 
@@ -213,7 +214,10 @@ fn help_when_stuck(shared: &Arc<Shared>) {
         state = shared.state.lock();
         if let Err(error) = started {
             state.spare -= 1;
-            tracing::warn!(%error, "all callback threads are busy, and no spare thread could be started");
+            tracing::warn!(
+                %error,
+                "all callback threads are busy, and no spare thread could be started",
+            );
         }
     }
 }
@@ -290,10 +294,12 @@ pub(crate) mod tests {
                 self.0.fetch_add(1, Ordering::SeqCst) + 1 < self.1
             }
         }
-        // Where the machine lets no thread run for as long as a job that is stuck takes, there is one: not each time.
+        // Where the machine lets no thread run for as long as a job that is stuck takes, there is
+        // one: not each time.
         let needs_none = (0..3).any(|_| {
             let pool = Pool::start(2, &Supervisor::new("t")).unwrap();
-            let jobs: Vec<_> = (0..4).map(|_| Arc::new(Counting(AtomicUsize::new(0), 5_000))).collect();
+            let jobs: Vec<_> =
+                (0..4).map(|_| Arc::new(Counting(AtomicUsize::new(0), 5_000))).collect();
             for job in &jobs {
                 pool.handle().submit(Arc::clone(job) as Arc<dyn Job>);
             }

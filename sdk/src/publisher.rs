@@ -75,8 +75,8 @@ struct Shared {
     writer: WriterId,
     /// How long a message is of use; zero = for ever.
     lifespan: Duration,
-    /// What all messages have in common, and the last sequence. Locked until the broker has the message, so that
-    /// sequences reach it in order.
+    /// What all messages have in common, and the last sequence. Locked until the broker has the
+    /// message, so that sequences reach it in order.
     next: Mutex<Header>,
 }
 
@@ -109,8 +109,9 @@ impl Publisher {
         }
     }
 
-    /// Publishes a payload of at most 16 MiB, now. A message that is [`PublishOutcome::Dropped`] has used up a sequence, so
-    /// that subscribers see the loss; one that is [`PublishOutcome::TooLarge`] has not.
+    /// Publishes a payload of at most 16 MiB, now. A message that is [`PublishOutcome::Dropped`]
+    /// has used up a sequence, so that subscribers see the loss; one that is
+    /// [`PublishOutcome::TooLarge`] has not.
     pub fn publish(&self, payload: Bytes) -> PublishOutcome {
         self.publish_at(payload, SystemTime::now())
     }
@@ -121,7 +122,8 @@ impl Publisher {
             return PublishOutcome::TooLarge;
         }
         let since_epoch = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-        let deadline = (self.shared.lifespan > Duration::ZERO).then(|| Instant::now() + self.shared.lifespan);
+        let deadline =
+            (self.shared.lifespan > Duration::ZERO).then(|| Instant::now() + self.shared.lifespan);
         let mut header = self.shared.next.lock();
         header.sequence += 1;
         header.publish_time_ns = u64::try_from(since_epoch.as_nanos()).unwrap_or(u64::MAX);
@@ -137,7 +139,11 @@ impl Publisher {
             Err(error) => {
                 // The options were checked, so this is a fault of the SDK; the publisher goes on.
                 header.sequence -= 1;
-                tracing::error!(topic = %self.shared.topic, %error, "a message could not be framed");
+                tracing::error!(
+                    topic = %self.shared.topic,
+                    %error,
+                    "a message could not be framed",
+                );
                 PublishOutcome::TooLarge
             }
         }

@@ -3,7 +3,8 @@
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Broker, BrokerError, BrokerKind, Content, PublisherOptions, Received, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, Content, PublisherOptions, Received, SubscribeOptions,
+    Subscription,
 };
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
@@ -25,8 +26,8 @@ pub(crate) fn reply_channel(kind: BrokerKind, own: ChannelName) -> ChannelName {
     }
 }
 
-/// How a service speaks there. What is lost is said again, so only DDS is asked to repair it: there, whoever listens reliably
-/// does not hear who speaks otherwise.
+/// How a service speaks there. What is lost is said again, so only DDS is asked to repair it:
+/// there, whoever listens reliably does not hear who speaks otherwise.
 pub(crate) fn speaking(kind: BrokerKind) -> PublisherOptions {
     PublisherOptions {
         reliable: matches!(kind, BrokerKind::Dds | BrokerKind::Ros2),
@@ -36,10 +37,8 @@ pub(crate) fn speaking(kind: BrokerKind) -> PublisherOptions {
 
 /// A channel of this name.
 pub(crate) fn channel(name: &str) -> Result<ChannelName, BrokerError> {
-    name.parse().map_err(|error| BrokerError::Name {
-        channel: name.to_owned(),
-        reason: format!("{error}"),
-    })
+    name.parse()
+        .map_err(|error| BrokerError::Name { channel: name.to_owned(), reason: format!("{error}") })
 }
 
 /// The payload of a message without a header; nothing else is spoken there.
@@ -59,7 +58,10 @@ pub(crate) async fn until(next: Option<Instant>) {
 }
 
 /// Subscribes as soon as the broker lets it.
-pub(crate) async fn subscribe(broker: &dyn Broker, channel: &ChannelName) -> Result<Subscription, BrokerError> {
+pub(crate) async fn subscribe(
+    broker: &dyn Broker,
+    channel: &ChannelName,
+) -> Result<Subscription, BrokerError> {
     let mut pause = FIRST_PAUSE;
     let mut status = broker.status();
     loop {
@@ -84,7 +86,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn answers_come_on_a_channel_of_ones_own_only_where_the_broker_makes_channels_as_they_are_named() {
+    fn answers_come_on_a_channel_of_ones_own_only_where_the_broker_makes_channels_as_they_are_named()
+     {
         let own: ChannelName = "blaze/reply/slam-0-7f".parse().unwrap();
         for kind in [BrokerKind::Memory, BrokerKind::Redis] {
             assert_eq!(reply_channel(kind, own.clone()), own, "{kind}");

@@ -110,8 +110,9 @@ impl Shared {
     }
 }
 
-/// A service's door into the system: the local broker and the flow. Dropping it ends all that it started; what it leased
-/// then lapses at the flow, whereas [`ServiceManager::shutdown`] withdraws it.
+/// A service's door into the system: the local broker and the flow. Dropping it ends all that it
+/// started; what it leased then lapses at the flow, whereas [`ServiceManager::shutdown`] withdraws
+/// it.
 pub struct ServiceManager {
     shared: Arc<Shared>,
     broker: LocalBroker,
@@ -121,12 +122,12 @@ pub struct ServiceManager {
 }
 
 impl ServiceManager {
-    /// Starts the service's threads and tasks. It does not wait for the broker or a flow, but for the services of `wait_for`,
-    /// saying meanwhile that it is `starting`.
+    /// Starts the service's threads and tasks. It does not wait for the broker or a flow, but for
+    /// the services of `wait_for`, saying meanwhile that it is `starting`.
     ///
     /// # Errors
-    /// [`SdkError::Option`], [`SdkError::Threads`], [`SdkError::Cache`], or [`SdkError::Wait`] when a service that it waits for
-    /// is not ready in time.
+    /// [`SdkError::Option`], [`SdkError::Threads`], [`SdkError::Cache`], or [`SdkError::Wait`] when
+    /// a service that it waits for is not ready in time.
     pub async fn start(options: ServiceOptions) -> Result<Self, SdkError> {
         let ttl_s = u32::try_from(options.lease_ttl.as_secs())
             .ok()
@@ -138,7 +139,9 @@ impl ServiceManager {
         options.check_watchdog()?;
         options.check_instance()?;
         let store = match &options.cache {
-            Some(section) => Some(Arc::new(RedisKeys::open(section).map_err(SdkError::Cache)?) as Arc<dyn Store>),
+            Some(section) => {
+                Some(Arc::new(RedisKeys::open(section).map_err(SdkError::Cache)?) as Arc<dyn Store>)
+            }
             None => None,
         };
         let pool_threads = match options.pool_threads {
@@ -196,18 +199,14 @@ impl ServiceManager {
             &shared.supervisor,
         );
         // From here on an early return ends what was started.
-        let service = Self {
-            broker: LocalBroker::new(Arc::clone(&shared)),
-            shared,
-            flow,
-            config,
-            cache,
-        };
+        let service =
+            Self { broker: LocalBroker::new(Arc::clone(&shared)), shared, flow, config, cache };
         if !options.wait_for.is_empty() {
             service.cache.set_state(ServiceState::Starting);
             let stopping = service.shared.supervisor.stopping_token();
             let waited = tokio::select! {
-                waited = service.cache.wait_for(&options.wait_for, options.wait_timeout) => waited.map_err(SdkError::Wait),
+                waited = service.cache.wait_for(&options.wait_for, options.wait_timeout) =>
+                    waited.map_err(SdkError::Wait),
                 () = stopping.cancelled() => Err(SdkError::ShutDown),
             };
             if let Err(error) = waited {
@@ -237,7 +236,8 @@ impl ServiceManager {
         &self.config
     }
 
-    /// The service's configuration, for a program that has a node file besides. Begins to ask for it; one is enough.
+    /// The service's configuration, for a program that has a node file besides. Begins to ask for
+    /// it; one is enough.
     #[must_use]
     pub fn program_config(&self) -> ProgramConfig {
         ProgramConfig::start(self.config(), &self.shared.supervisor)
@@ -255,13 +255,17 @@ impl ServiceManager {
         &self.shared.identity
     }
 
-    /// Withdraws all leases, takes its sign of life away, ends all subscriptions, and waits for tasks and for callbacks that run: at most some 7 s. The
-    /// broker stays open.
+    /// Withdraws all leases, takes its sign of life away, ends all subscriptions, and waits for
+    /// tasks and for callbacks that run: at most some 7 s. The broker stays open.
     pub async fn shutdown(self) {
         let (flow, cache) = (self.flow.clone(), self.cache.clone());
-        let steps = ShutdownSteps::new(LEAVE_WITHIN + END_WITHIN).on(ShutdownPhase::Drain, "leases", async move {
-            tokio::join!(flow.leave(LEAVE_WITHIN), cache.leave(LEAVE_WITHIN));
-        });
+        let steps = ShutdownSteps::new(LEAVE_WITHIN + END_WITHIN).on(
+            ShutdownPhase::Drain,
+            "leases",
+            async move {
+                tokio::join!(flow.leave(LEAVE_WITHIN), cache.leave(LEAVE_WITHIN));
+            },
+        );
         let report = self.shared.supervisor.shutdown_with(steps).await;
         if !report.is_clean() {
             tracing::warn!(
@@ -290,7 +294,11 @@ fn observed(name: String) -> Supervisor {
         let end = watched.shutdown_token();
         tokio::select! {
             () = end.cancelled() => {}
-            reason = watched.failed() => tracing::error!(service = watched.name(), reason, "a part of the service failed"),
+            reason = watched.failed() => tracing::error!(
+                service = watched.name(),
+                reason,
+                "a part of the service failed",
+            ),
         }
     });
     supervisor
@@ -298,9 +306,7 @@ fn observed(name: String) -> Supervisor {
 
 /// Milliseconds since 1970.
 pub(crate) fn now_ms() -> u64 {
-    let since_epoch = SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .unwrap_or_default();
+    let since_epoch = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
 }
 

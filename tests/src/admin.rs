@@ -44,16 +44,14 @@ impl Admin {
         self.get("/readyz").is_ok_and(|(status, _)| status == 200)
     }
 
-    /// The value of a metric line that starts with `name` and holds all `labels`; `None` when there is none.
+    /// The value of a metric line that starts with `name` and holds all `labels`; `None` when there
+    /// is none.
     #[must_use]
     pub fn metric(&self, name: &str, labels: &[&str]) -> Option<f64> {
         let (_, text) = self.get("/metrics").ok()?;
         let line = text.lines().find(|line| {
             line.starts_with(name)
-                && line
-                    .as_bytes()
-                    .get(name.len())
-                    .is_some_and(|b| matches!(b, b'{' | b' '))
+                && line.as_bytes().get(name.len()).is_some_and(|b| matches!(b, b'{' | b' '))
                 && labels.iter().all(|label| line.contains(label))
         })?;
         line.rsplit(' ').next()?.parse().ok()

@@ -36,7 +36,8 @@ pub struct FlowSpec {
     pub domain: Option<u16>,
     /// The host of a network that it runs on; absent = this machine.
     pub host: Option<Host>,
-    /// Addresses of flows to begin with; empty = loopback, which a host of a network does not share.
+    /// Addresses of flows to begin with; empty = loopback, which a host of a network does not
+    /// share.
     pub peers: Vec<Ipv4Addr>,
     /// `flow.bandwidth.limit_mbps`.
     pub limit_mbps: f64,
@@ -114,7 +115,8 @@ impl FlowSpec {
             self.layer, self.node
         );
         if let Some((url, prefix)) = &self.redis {
-            let _ = writeln!(text, "  node: {{ redis: {{ url: \"{url}\", prefix: \"{prefix}\" }} }}");
+            let _ =
+                writeln!(text, "  node: {{ redis: {{ url: \"{url}\", prefix: \"{prefix}\" }} }}");
         }
         if let Some((bootstrap, prefix)) = &self.kafka {
             let _ = writeln!(
@@ -174,13 +176,7 @@ impl FlowProcess {
         let file = folder.path().join("blaze.yaml");
         std::fs::write(&file, spec.to_yaml(folder.path()))?;
         let process = run(&file, spec.host.as_ref())?;
-        Ok(Self {
-            spec,
-            file,
-            process,
-            admin: None,
-            folder,
-        })
+        Ok(Self { spec, file, process, admin: None, folder })
     }
 
     /// Starts it and waits until it is ready.
@@ -330,8 +326,9 @@ impl FlowProcess {
     /// Ids of the bridges that are up, sorted.
     #[must_use]
     pub fn bridges_up(&self) -> Vec<String> {
-        let up =
-            |bridge: &Value| (bridge["state"] == "up").then(|| bridge["id"].as_str().unwrap_or_default().to_owned());
+        let up = |bridge: &Value| {
+            (bridge["state"] == "up").then(|| bridge["id"].as_str().unwrap_or_default().to_owned())
+        };
         let mut ids: Vec<String> = self.bridges().iter().filter_map(up).collect();
         ids.sort();
         ids
@@ -392,12 +389,14 @@ fn run(file: &Path, host: Option<&Host>) -> anyhow::Result<Process> {
     Process::start("blaze-flow", &["--config", &file.to_string_lossy()], namespace)
 }
 
-/// A DDS domain that nobody uses on loopback now, so that another run of these tests is no neighbour.
+/// A DDS domain that nobody uses on loopback now, so that another run of these tests is no
+/// neighbour.
 ///
 /// # Errors
 /// When there is none between 40 and 99.
 pub fn free_domain() -> anyhow::Result<u16> {
-    /// Locked files, one for each domain of this process: tests in other processes look for domains at the same time.
+    /// Locked files, one for each domain of this process: tests in other processes look for domains
+    /// at the same time.
     static HELD: parking_lot::Mutex<Vec<File>> = parking_lot::Mutex::new(Vec::new());
     let folder = std::env::temp_dir().join("blaze-test-domains");
     std::fs::create_dir_all(&folder)?;
@@ -411,7 +410,9 @@ pub fn free_domain() -> anyhow::Result<u16> {
     };
     // SPDP and user traffic of the first three participants.
     let is_quiet = |domain: u16| {
-        (10..16).all(|offset| UdpSocket::bind((Ipv4Addr::LOCALHOST, 7_400 + 250 * domain + offset)).is_ok())
+        (10..16).all(|offset| {
+            UdpSocket::bind((Ipv4Addr::LOCALHOST, 7_400 + 250 * domain + offset)).is_ok()
+        })
     };
     let first = (std::process::id() % 60) as u16;
     for domain in (0..60).map(|step| 40 + (first + step) % 60) {

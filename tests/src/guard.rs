@@ -1,9 +1,10 @@
-//! Ends servers and network namespaces that outlive the test's process, which may die without running a destructor (a signal,
-//! an abort, a server kept in a static).
+//! Ends servers and network namespaces that outlive the test's process, which may die without
+//! running a destructor (a signal, an abort, a server kept in a static).
 //!
-//! One shell per process reads a pipe that only this process holds. When the pipe closes, the process has gone, and the
-//! shell kills what was not taken off its list. A process counts only while its start time is the one that was noted, so
-//! that a number given again by the system is left alone.
+//! One shell per process reads a pipe that only this process holds. When the pipe closes, the
+//! process has gone, and the shell kills what was not taken off its list. A process counts only
+//! while its start time is the one that was noted, so that a number given again by the system is
+//! left alone.
 
 use std::io::Write as _;
 use std::os::unix::process::CommandExt as _;
@@ -70,8 +71,7 @@ fn tell(line: &str) -> anyhow::Result<()> {
         Some(pipe) => pipe,
         None => guard.insert(start()?),
     };
-    pipe.write_all(line.as_bytes())
-        .context("the guard of this process has gone")
+    pipe.write_all(line.as_bytes()).context("the guard of this process has gone")
 }
 
 fn start() -> anyhow::Result<ChildStdin> {

@@ -1,4 +1,5 @@
-//! What was published of a numbered stream and what came of it, dropped by identity as the SDK does.
+//! What was published of a numbered stream and what came of it, dropped by identity as the SDK
+//! does.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -88,7 +89,8 @@ impl Ledger {
             *times.entry(*number).or_default() += 1;
         }
         let arrived: Vec<u64> = self.arrived.iter().map(|(number, _)| *number).collect();
-        let of_sent: Vec<u64> = arrived.into_iter().filter(|number| sent.contains(number)).collect();
+        let of_sent: Vec<u64> =
+            arrived.into_iter().filter(|number| sent.contains(number)).collect();
         Fate {
             sent: sent.len(),
             lost: sent.iter().filter(|number| !times.contains_key(number)).count(),
@@ -101,10 +103,7 @@ impl Ledger {
     /// The longest time without an arrival that has a part between two moments.
     #[must_use]
     pub fn gap(&self, from: Instant, to: Instant) -> Duration {
-        let pairs = self
-            .arrived
-            .windows(2)
-            .filter(|pair| pair[1].1 > from && pair[0].1 < to);
+        let pairs = self.arrived.windows(2).filter(|pair| pair[1].1 > from && pair[0].1 < to);
         let gaps = pairs.map(|pair| pair[1].1.saturating_duration_since(pair[0].1));
         gaps.max().unwrap_or(Duration::MAX)
     }
@@ -128,13 +127,7 @@ mod tests {
         }
         ledger.take(("w".to_owned(), 9), b"no number", at(90));
         let found = ledger.fate(|number, _| number < 5);
-        let expected = Fate {
-            sent: 4,
-            lost: 1,
-            twice: 1,
-            reordered: 1,
-            repeats: 1,
-        };
+        let expected = Fate { sent: 4, lost: 1, twice: 1, reordered: 1, repeats: 1 };
         assert_eq!(found, expected);
         assert_eq!(ledger.gap(at(0), at(25)), Duration::from_millis(10));
         assert_eq!((ledger.last_published(), ledger.last_arrived()), (Some(5), Some(3)));

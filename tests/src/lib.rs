@@ -1,4 +1,5 @@
-//! What end-to-end tests stand on: real processes and servers, emulated networks, faults, and waits on conditions.
+//! What end-to-end tests stand on: real processes and servers, emulated networks, faults, and waits
+//! on conditions.
 
 use std::time::Duration;
 
@@ -19,8 +20,9 @@ pub mod stream;
 pub mod wait;
 pub mod wan;
 
-/// A limit of delay: as it is where each test has the machine for itself (`scripts/test --long`), else four times as much and at
-/// most two seconds more, as others that run beside take their share of two processors.
+/// A limit of delay: as it is where each test has the machine for itself (`scripts/test --long`),
+/// else four times as much and at most two seconds more, as others that run beside take their share
+/// of two processors.
 #[must_use]
 pub fn within(limit: Duration) -> Duration {
     const MOST: Duration = Duration::from_secs(2);

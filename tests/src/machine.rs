@@ -36,7 +36,10 @@ impl Idler {
                 std::thread::sleep(LOOK);
                 let now = Instant::now();
                 let late = now.duration_since(before).saturating_sub(LOOK);
-                seen.fetch_max(u64::try_from(late.as_nanos()).unwrap_or(u64::MAX), Ordering::Relaxed);
+                seen.fetch_max(
+                    u64::try_from(late.as_nanos()).unwrap_or(u64::MAX),
+                    Ordering::Relaxed,
+                );
                 before = now;
             }
         });
@@ -67,7 +70,8 @@ pub struct Machine {
     pub sync_ms: f64,
     /// Programs that wanted a processor in the minute before.
     pub load_average: f64,
-    /// Whether this program, and so the rest of the workspace beside it, was built with optimisation.
+    /// Whether this program, and so the rest of the workspace beside it, was built with
+    /// optimisation.
     pub optimised: bool,
 }
 
@@ -107,7 +111,9 @@ impl Machine {
         }
         if self.in_memory {
             remarks.push(
-                "this file system is in memory, where syncing costs nothing: choose another one with --data".to_owned(),
+                "this file system is in memory, where syncing costs nothing: choose another one \
+                 with --data"
+                    .to_owned(),
             );
         }
         if !self.optimised {
@@ -139,11 +145,14 @@ fn value_of(file: &str, name: &str) -> Option<String> {
     Some(value.trim().to_owned())
 }
 
-/// Type of the file system of a folder: that of the deepest mount above it, the last one where two are the same.
+/// Type of the file system of a folder: that of the deepest mount above it, the last one where two
+/// are the same.
 fn file_system<'a>(mounts: &'a str, folder: &Path) -> Option<&'a str> {
     let fields = mounts.lines().map(|line| line.split(' ').collect::<Vec<_>>());
     let above = fields.filter_map(|fields| match fields[..] {
-        [_, place, kind, ..] if folder.starts_with(place) => Some((Path::new(place).components().count(), kind)),
+        [_, place, kind, ..] if folder.starts_with(place) => {
+            Some((Path::new(place).components().count(), kind))
+        }
         _ => None,
     });
     above.max_by_key(|(depth, _)| *depth).map(|(_, kind)| kind)

@@ -14,7 +14,8 @@ const CHUNK: usize = 4 << 20;
 /// When the system does not let anybody look.
 pub(crate) fn count(id: u32, needle: &[u8]) -> anyhow::Result<usize> {
     let maps = std::fs::read_to_string(format!("/proc/{id}/maps"))?;
-    let memory = File::open(format!("/proc/{id}/mem")).with_context(|| format!("the memory of process {id}"))?;
+    let memory = File::open(format!("/proc/{id}/mem"))
+        .with_context(|| format!("the memory of process {id}"))?;
     let (mut count, mut read) = (0, 0);
     for line in maps.lines() {
         let mut words = line.split_whitespace();

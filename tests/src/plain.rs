@@ -78,7 +78,9 @@ impl KafkaReader {
         let offset = loop {
             match consumer.fetch_watermarks(topic, 0, Duration::from_secs(2)) {
                 Ok((beginning, end)) => break start(beginning, end),
-                Err(error) if Instant::now() > until => return Err(error).context(topic.to_owned()),
+                Err(error) if Instant::now() > until => {
+                    return Err(error).context(topic.to_owned());
+                }
                 Err(_) => std::thread::sleep(Duration::from_millis(20)),
             }
         };
@@ -101,7 +103,8 @@ impl KafkaReader {
                 Some(Ok(message)) => {
                     let mut headers = BTreeMap::new();
                     for header in message.headers().into_iter().flat_map(|headers| headers.iter()) {
-                        let value = String::from_utf8_lossy(header.value.unwrap_or_default()).into_owned();
+                        let value =
+                            String::from_utf8_lossy(header.value.unwrap_or_default()).into_owned();
                         headers.insert(header.key.to_owned(), value);
                     }
                     return Some(Record {
@@ -140,11 +143,8 @@ pub fn publish(url: &str, channel: &str, payload: &[u8]) -> anyhow::Result<i64> 
 /// # Errors
 /// As [`publish`], and when others than the flow alone hear it.
 pub fn tell_redis(url: &str, prefix: &str, message: &Value) -> anyhow::Result<()> {
-    let heard = publish(
-        url,
-        &format!("{prefix}blaze/flow/control"),
-        message.to_string().as_bytes(),
-    )?;
+    let heard =
+        publish(url, &format!("{prefix}blaze/flow/control"), message.to_string().as_bytes())?;
     anyhow::ensure!(heard == 1, "{heard} heard a control message instead of the flow alone");
     Ok(())
 }
@@ -169,12 +169,14 @@ impl RedisReader {
     /// When the server does not answer within two seconds.
     pub fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
         let info = url.into_connection_info()?;
-        // In RESP2 the client library takes a message for the late answer to a read that timed out, and skips it.
+        // In RESP2 the client library takes a message for the late answer to a read that timed out,
+        // and skips it.
         let settings = info.redis_settings().clone().set_protocol(ProtocolVersion::RESP3);
         let client = redis::Client::open(info.set_redis_settings(settings))?;
         let mut connection = client.get_connection_with_timeout(Duration::from_secs(2))?;
         connection.set_read_timeout(Some(Duration::from_secs(2)))?;
-        connection.send_packed_command(&redis::cmd("SUBSCRIBE").arg(channel).get_packed_command())?;
+        connection
+            .send_packed_command(&redis::cmd("SUBSCRIBE").arg(channel).get_packed_command())?;
         connection.recv_response()?;
         connection.set_read_timeout(Some(Duration::from_millis(50)))?;
         Ok(Self { connection })
@@ -187,10 +189,7 @@ impl RedisReader {
     pub fn poll(&mut self) -> anyhow::Result<Option<Vec<u8>>> {
         loop {
             match self.connection.recv_response() {
-                Ok(redis::Value::Push {
-                    kind: PushKind::Message,
-                    data,
-                }) => {
+                Ok(redis::Value::Push { kind: PushKind::Message, data }) => {
                     if let Some(redis::Value::BulkString(payload)) = data.into_iter().nth(1) {
                         return Ok(Some(payload));
                     }
@@ -221,9 +220,8 @@ impl RedisReader {
     /// # Errors
     /// When none comes in time, or something else.
     pub fn next_json(&mut self, within: Duration) -> anyhow::Result<serde_json::Value> {
-        let payload = self
-            .next(within)?
-            .with_context(|| format!("nothing came within {within:?}"))?;
+        let payload =
+            self.next(within)?.with_context(|| format!("nothing came within {within:?}"))?;
         Ok(serde_json::from_slice(&payload)?)
     }
 }
@@ -287,13 +285,15 @@ impl KafkaWriter {
     ///
     /// # Errors
     /// As [`KafkaWriter::produce`].
-    pub fn produce_with(&self, topic: &str, payload: &[u8], headers: &[(&str, &[u8])]) -> anyhow::Result<()> {
+    pub fn produce_with(
+        &self,
+        topic: &str,
+        payload: &[u8],
+        headers: &[(&str, &[u8])],
+    ) -> anyhow::Result<()> {
         let mut all = OwnedHeaders::new();
         for (key, value) in headers {
-            all = all.insert(Header {
-                key,
-                value: Some(*value),
-            });
+            all = all.insert(Header { key, value: Some(*value) });
         }
         self.producer
             .send(BaseRecord::<'_, (), [u8]>::to(topic).payload(payload).headers(all))

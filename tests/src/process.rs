@@ -22,7 +22,8 @@ const MAX_LINES: usize = 20_000;
 /// For the output of a process that has ended.
 const REST: Duration = Duration::from_secs(5);
 
-/// A binary of the workspace, beside the test's own: in `target/<profile>`, while tests lie in its folder `deps`.
+/// A binary of the workspace, beside the test's own: in `target/<profile>`, while tests lie in its
+/// folder `deps`.
 ///
 /// # Errors
 /// When it has not been built.
@@ -42,15 +43,17 @@ pub fn binary(name: &str) -> anyhow::Result<PathBuf> {
     Ok(path)
 }
 
-/// Puts this thread, and those that it starts from now on, before all others where the system lets it. For what keeps or
-/// measures time: on a busy machine it would be late by a time slice of somebody else.
+/// Puts this thread, and those that it starts from now on, before all others where the system lets
+/// it. For what keeps or measures time: on a busy machine it would be late by a time slice of
+/// somebody else.
 pub fn hurry() {
     const HIGHEST: i32 = -20;
     // Without the right to it times are less exact on a busy machine, and nothing else.
     let _ = setpriority_process(None, HIGHEST);
 }
 
-/// CPU time that a process has used, of all its threads, in the program and in the system for it; in steps of 10 ms.
+/// CPU time that a process has used, of all its threads, in the program and in the system for it;
+/// in steps of 10 ms.
 ///
 /// # Errors
 /// When there is no such process.
@@ -60,8 +63,9 @@ pub fn cpu_time(id: u32) -> anyhow::Result<Duration> {
     let text = std::fs::read_to_string(format!("/proc/{id}/stat"))?;
     let after_name = text.rsplit_once(')').context("no name in /proc/PID/stat")?.1;
     let fields: Vec<&str> = after_name.split_whitespace().collect();
-    let ticks =
-        |index: usize| -> anyhow::Result<f64> { Ok(fields.get(index).context("a short line")?.parse::<u64>()? as f64) };
+    let ticks = |index: usize| -> anyhow::Result<f64> {
+        Ok(fields.get(index).context("a short line")?.parse::<u64>()? as f64)
+    };
     Ok(Duration::from_secs_f64((ticks(11)? + ticks(12)?) / TICKS_PER_S))
 }
 
@@ -133,7 +137,8 @@ impl Process {
         Self::launch(name, arguments, namespace, &[], None)
     }
 
-    /// Starts one of the tests' own programs, a subcommand of `blaze-testbed`, in a namespace if one is named.
+    /// Starts one of the tests' own programs, a subcommand of `blaze-testbed`, in a namespace if
+    /// one is named.
     ///
     /// # Errors
     /// When it is not built or does not start.
@@ -141,15 +146,21 @@ impl Process {
         Self::start("blaze-testbed", &[&[name], arguments].concat(), namespace)
     }
 
-    /// Starts a program of the workspace with variables of the environment besides those of the test.
+    /// Starts a program of the workspace with variables of the environment besides those of the
+    /// test.
     ///
     /// # Errors
     /// When it is not built or does not start.
-    pub fn start_with(name: &str, arguments: &[&str], environment: &[(&str, &OsStr)]) -> anyhow::Result<Self> {
+    pub fn start_with(
+        name: &str,
+        arguments: &[&str],
+        environment: &[(&str, &OsStr)],
+    ) -> anyhow::Result<Self> {
         Self::launch(name, arguments, None, environment, None)
     }
 
-    /// Starts a program of the workspace that says more than is kept: all of its stderr is written to a file, too.
+    /// Starts a program of the workspace that says more than is kept: all of its stderr is written
+    /// to a file, too.
     ///
     /// # Errors
     /// When it is not built or does not start, or the file cannot be made.
@@ -180,16 +191,11 @@ impl Process {
         let mut readers = Vec::new();
         let stdout = collect(child.stdout.take(), None, &mut readers);
         let stderr = collect(child.stderr.take(), log, &mut readers);
-        Ok(Self {
-            child,
-            namespace: namespace.map(str::to_owned),
-            stdout,
-            stderr,
-            readers,
-        })
+        Ok(Self { child, namespace: namespace.map(str::to_owned), stdout, stderr, readers })
     }
 
-    /// Its process id. `ip netns exec` replaces itself, so it is that of the program also in a namespace.
+    /// Its process id. `ip netns exec` replaces itself, so it is that of the program also in a
+    /// namespace.
     #[must_use]
     pub fn id(&self) -> u32 {
         self.child.id()
@@ -219,10 +225,7 @@ impl Process {
             || self.stderr().into_iter().find(|line| line.starts_with(&start)),
             || self.tail(),
         )?;
-        Ok(Admin {
-            address: address_in(&line, "admin")?,
-            namespace: self.namespace.clone(),
-        })
+        Ok(Admin { address: address_in(&line, "admin")?, namespace: self.namespace.clone() })
     }
 
     /// Waits for the line `ready rest=ADDRESS …` on stdout and gives one of the addresses in it.
@@ -283,7 +286,8 @@ impl Process {
         Ok(self.end(deadline)?.code())
     }
 
-    /// Waits for its end and gives all that the system says of it; what it printed has been read by then.
+    /// Waits for its end and gives all that the system says of it; what it printed has been read by
+    /// then.
     ///
     /// # Errors
     /// When it does not end in time.
@@ -349,8 +353,8 @@ impl Drop for Process {
     }
 }
 
-/// Where all that a process says on stderr is written, besides what is kept: in the folder `BLAZE_TEST_LOGS`, if that is given. For runs that
-/// are too long to keep everything.
+/// Where all that a process says on stderr is written, besides what is kept: in the folder
+/// `BLAZE_TEST_LOGS`, if that is given. For runs that are too long to keep everything.
 fn log_file(name: &str, id: u32) -> anyhow::Result<Option<File>> {
     let Some(folder) = std::env::var_os("BLAZE_TEST_LOGS") else {
         return Ok(None);

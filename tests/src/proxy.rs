@@ -59,7 +59,8 @@ impl Proxy {
         self.address
     }
 
-    /// Accepts connections and keeps those that are there, but lets nothing pass until [`Proxy::heal`].
+    /// Accepts connections and keeps those that are there, but lets nothing pass until
+    /// [`Proxy::heal`].
     pub fn stall(&self) {
         self.gate.set(true);
     }

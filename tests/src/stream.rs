@@ -41,12 +41,18 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// Publishes payloads of that size on a Redis channel at [`RATE_HZ`] and reads a Kafka topic. Both ends wait out a server
-    /// that is away.
+    /// Publishes payloads of that size on a Redis channel at [`RATE_HZ`] and reads a Kafka topic.
+    /// Both ends wait out a server that is away.
     ///
     /// # Errors
     /// When the topic is not there within ten seconds.
-    pub fn start(redis: &str, channel: &str, kafka: &str, topic: &str, bytes: usize) -> anyhow::Result<Self> {
+    pub fn start(
+        redis: &str,
+        channel: &str,
+        kafka: &str,
+        topic: &str,
+        bytes: usize,
+    ) -> anyhow::Result<Self> {
         let reader = KafkaReader::from_end(kafka, topic)?;
         let (redis, channel) = (redis.to_owned(), channel.to_owned());
         Ok(Self::with(reader, move |shared, base| {
@@ -64,7 +70,8 @@ impl Stream {
         bytes: usize,
     ) -> anyhow::Result<Self> {
         let reader = inside(&to.namespace, || KafkaReader::from_end(kafka, topic))?;
-        let (namespace, redis, channel) = (from.namespace.clone(), redis.to_owned(), channel.to_owned());
+        let (namespace, redis, channel) =
+            (from.namespace.clone(), redis.to_owned(), channel.to_owned());
         Ok(Self::with(reader, move |shared, base| {
             // Without the namespace nothing is published, which whoever waits for it will tell.
             let _ = inside(&namespace, || {
@@ -95,10 +102,7 @@ impl Stream {
                 }
             }
         });
-        Self {
-            shared,
-            threads: vec![source, sink],
-        }
+        Self { shared, threads: vec![source, sink] }
     }
 
     /// Messages that a server took from the publisher.
@@ -126,10 +130,7 @@ impl Stream {
     pub fn wait_fresh(&self, deadline: Duration) -> anyhow::Result<Duration> {
         let begin = Instant::now();
         loop {
-            if self
-                .last()
-                .is_some_and(|last| last.at > begin && last.at - last.took > begin)
-            {
+            if self.last().is_some_and(|last| last.at > begin && last.at - last.took > begin) {
                 return Ok(begin.elapsed());
             }
             anyhow::ensure!(begin.elapsed() < deadline, "nothing new arrives within {deadline:?}");
@@ -145,15 +146,10 @@ impl Stream {
         for arrival in &arrivals {
             *seen.entry(arrival.number).or_default() += 1;
         }
-        let twice = seen
-            .into_iter()
-            .filter(|(_, count)| *count > 1)
-            .map(|(number, _)| number)
-            .collect();
-        let reordered = arrivals
-            .windows(2)
-            .filter(|pair| pair[1].number < pair[0].number)
-            .count() as u64;
+        let twice =
+            seen.into_iter().filter(|(_, count)| *count > 1).map(|(number, _)| number).collect();
+        let reordered =
+            arrivals.windows(2).filter(|pair| pair[1].number < pair[0].number).count() as u64;
         (twice, reordered)
     }
 
@@ -166,7 +162,8 @@ impl Stream {
         gaps.max().unwrap_or(Duration::MAX)
     }
 
-    /// Of the messages that were sent between two moments: how long the slowest hundredth took at least.
+    /// Of the messages that were sent between two moments: how long the slowest hundredth took at
+    /// least.
     #[must_use]
     pub fn p99(&self, from: Instant, to: Instant) -> Option<Duration> {
         let mut took: Vec<Duration> = self
@@ -176,8 +173,7 @@ impl Stream {
             .map(|arrival| arrival.took)
             .collect();
         took.sort_unstable();
-        took.get((took.len() * 99 / 100).min(took.len().checked_sub(1)?))
-            .copied()
+        took.get((took.len() * 99 / 100).min(took.len().checked_sub(1)?)).copied()
     }
 }
 

@@ -40,8 +40,8 @@ struct Inner {
 }
 
 impl Shown {
-    /// Serves the admin port of a worker that is [started](Self::set) afterwards, so that it can be asked from the beginning. `scope`
-    /// is that of its broker.
+    /// Serves the admin port of a worker that is [started](Self::set) afterwards, so that it can be
+    /// asked from the beginning. `scope` is that of its broker.
     ///
     /// # Errors
     /// When the port cannot be bound.
@@ -101,11 +101,7 @@ impl Shown {
                 continue;
             };
             let (is_reached, words) = worker.reach();
-            let state = if is_reached {
-                CheckStatus::Ok
-            } else {
-                CheckStatus::Failed
-            };
+            let state = if is_reached { CheckStatus::Ok } else { CheckStatus::Failed };
             readiness.set(broker, state, words);
             // The answer has all services in it: not 20 times a second for nothing.
             let is_due = is_reached || looked.is_none_or(|at: Instant| at.elapsed() >= LOOK);
@@ -124,8 +120,8 @@ impl Shown {
         }
     }
 
-    /// Waits until services reach it for the first time, and it serves what there is: the configuration, unless there is none here and the
-    /// main service cannot be reached either.
+    /// Waits until services reach it for the first time, and it serves what there is: the
+    /// configuration, unless there is none here and the main service cannot be reached either.
     pub async fn begun(&self) {
         // The sender lives as long as this.
         let _ = self.begun.subscribe().wait_for(|begun| *begun).await;
@@ -138,9 +134,7 @@ impl Shown {
             let inner = self.inner.lock();
             (inner.worker.clone(), inner.status.clone())
         };
-        worker
-            .zip(status)
-            .map_or_else(String::new, |(worker, status)| text_of(&worker, &status))
+        worker.zip(status).map_or_else(String::new, |(worker, status)| text_of(&worker, &status))
     }
 }
 
@@ -169,12 +163,7 @@ fn text_of(worker: &RunningWorker, status: &Status) -> String {
     let [main, copy, file] = ["main", "copy", "file"].map(|word| u8::from(json["source"] == word));
     let (revision, unwatched) = (status.revision, status.unwatched);
     let age = json["age_s"].as_f64().unwrap_or(f64::NAN);
-    let SpeakerCounts {
-        notices,
-        replaced,
-        waiting,
-        ..
-    } = worker.speaker();
+    let SpeakerCounts { notices, replaced, waiting, .. } = worker.speaker();
     let Counts {
         answered,
         refused,
@@ -264,7 +253,8 @@ async fn status(State(shown): State<Shown>) -> Response {
     match status {
         Some(status) => Json(status.json).into_response(),
         None => {
-            let body = json!({ "error": { "code": "not_ready", "detail": "the worker is starting or ending" } });
+            let body = json!({ "error": { "code": "not_ready", "detail": "the worker is starting \
+                or ending" } });
             (StatusCode::SERVICE_UNAVAILABLE, Json(body)).into_response()
         }
     }

@@ -82,7 +82,10 @@ pub(crate) async fn listen<T: Send>(
 }
 
 /// Says when the broker is away: what cannot be heard is not lost.
-pub(crate) async fn notice_deafness(mut status: watch::Receiver<BrokerStatus>, signs: mpsc::Sender<Sign>) {
+pub(crate) async fn notice_deafness(
+    mut status: watch::Receiver<BrokerStatus>,
+    signs: mpsc::Sender<Sign>,
+) {
     loop {
         let is_up = status.borrow_and_update().health == Health::Up;
         if is_up {
@@ -94,7 +97,8 @@ pub(crate) async fn notice_deafness(mut status: watch::Receiver<BrokerStatus>, s
             sleep(STILL_DEAF).await;
         }
         // Also when it is back: services need their time to be heard again.
-        if (!is_up || status.borrow().health != Health::Up) && signs.send(Sign::Deaf).await.is_err() {
+        if (!is_up || status.borrow().health != Health::Up) && signs.send(Sign::Deaf).await.is_err()
+        {
             return;
         }
     }
@@ -106,7 +110,8 @@ pub(crate) async fn scan(keys: Arc<RedisKeys>, signs: mpsc::Sender<Sign>) {
     let mut last_run = None;
     loop {
         sleep(SCAN).await;
-        // Which run of the server it is is asked last: records that a restart has taken are then known to be its doing.
+        // Which run of the server it is is asked last: records that a restart has taken are then
+        // known to be its doing.
         let found = match keys.records(RECORDS, MAX_SIGNS).await {
             Ok(records) => keys.run_id().await.map(|run| (records, run)),
             Err(error) => Err(error),

@@ -7,11 +7,8 @@ use super::*;
 
 #[tokio::test(start_paused = true)]
 async fn that_the_broker_is_away_is_said_each_second_and_once_more_when_it_is_back() {
-    let status = |health| BrokerStatus {
-        health,
-        detail: String::new(),
-        since: std::time::Instant::now(),
-    };
+    let status =
+        |health| BrokerStatus { health, detail: String::new(), since: std::time::Instant::now() };
     let (set, seen) = watch::channel(status(Health::Up));
     let (send, mut heard) = mpsc::channel(64);
     let mut tasks = JoinSet::new();
@@ -37,7 +34,8 @@ async fn that_the_broker_is_away_is_said_each_second_and_once_more_when_it_is_ba
 
 #[tokio::test(start_paused = true)]
 async fn a_redis_that_is_away_is_never_taken_for_one_without_records() {
-    let file = serde_json::json!({ "brokers": { "node": { "redis": { "url": "redis://127.0.0.1:1" } } } });
+    let file =
+        serde_json::json!({ "brokers": { "node": { "redis": { "url": "redis://127.0.0.1:1" } } } });
     let Some(NodeBroker::Redis(section)) = NodeFile::read(&file).unwrap().0.brokers.node else {
         panic!("no Redis in {file}");
     };

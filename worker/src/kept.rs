@@ -25,7 +25,8 @@ pub(crate) async fn open(
     let (folder, database) = match &settings.database {
         Some(DatabaseSection::Embedded { path }) => (Some(path.clone()), None),
         Some(DatabaseSection::MongoDb { uri, database }) => {
-            let copy = mongodb(uri.clone(), database, settings, vault).context("database.mongodb")?;
+            let copy =
+                mongodb(uri.clone(), database, settings, vault).context("database.mongodb")?;
             (folder, Some(copy))
         }
         None => (folder, None),

@@ -1,5 +1,6 @@
-//! BlazeConfig's worker: keeps a copy of what its layer sees, and gives every service its configuration over the local
-//! broker, also while the main service, the broker or a database is away.
+//! BlazeConfig's worker: keeps a copy of what its layer sees, and gives every service its
+//! configuration over the local broker, also while the main service, the broker or a database is
+//! away.
 //!
 //! ```text
 //! main service ──Sync──▶ core::Replica ──▶ core::Served ──▶ answers and notices on the local broker

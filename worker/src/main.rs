@@ -13,10 +13,13 @@ use blaze_domain::InstanceName;
 use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
 use blaze_runtime::admin::Readiness;
 use blaze_runtime::config::{
-    Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_typed, parse_override, watch_with,
+    Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_typed,
+    parse_override, watch_with,
 };
 use blaze_runtime::logs::{LogFormat, LogHandle};
-use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
+use blaze_runtime::supervisor::{
+    ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code,
+};
 use blaze_runtime::{environment, forbid_core_dumps, logs, ready_line, say, state};
 use blaze_worker::admin::Shown;
 use blaze_worker::lease;
@@ -27,7 +30,8 @@ use clap::Parser;
 /// A shutdown takes at most this long.
 const SHUTDOWN: Duration = Duration::from_secs(5);
 
-/// BlazeConfig's worker: every service of a node or layer has its configuration, also when the main service is gone.
+/// BlazeConfig's worker: every service of a node or layer has its configuration, also when the main
+/// service is gone.
 #[derive(Parser)]
 #[command(name = "blaze-worker", version)]
 struct Arguments {
@@ -86,10 +90,11 @@ fn schema() -> Schema<NodeFile> {
         Ok((file, warnings)) => {
             let mut faults = WorkerSettings::of(&file).err().unwrap_or_default();
             faults.extend(broker_fault(&file));
-            faults.extend(logs::check_level(&file.log.level).err().map(|detail| Fault {
-                path: "log.level".to_owned(),
-                detail,
-            }));
+            faults.extend(
+                logs::check_level(&file.log.level)
+                    .err()
+                    .map(|detail| Fault { path: "log.level".to_owned(), detail }),
+            );
             if faults.is_empty() {
                 Ok((file, warnings.into_iter().map(remark).collect()))
             } else {
@@ -100,13 +105,13 @@ fn schema() -> Schema<NodeFile> {
     })
 }
 
-/// What the adapter has against the section of the layer scope. What was not built in is told at the start.
+/// What the adapter has against the section of the layer scope. What was not built in is told at
+/// the start.
 fn broker_fault(file: &NodeFile) -> Option<Fault> {
     match check_layer(file.brokers.layer.as_ref()?) {
-        Err(OpenError::Setting { key, reason }) => Some(Fault {
-            path: format!("brokers.layer.{key}"),
-            detail: reason,
-        }),
+        Err(OpenError::Setting { key, reason }) => {
+            Some(Fault { path: format!("brokers.layer.{key}"), detail: reason })
+        }
         Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
     }
 }
@@ -134,31 +139,20 @@ async fn start(
     instance: InstanceName,
 ) -> anyhow::Result<(Arc<RunningWorker>, Readiness)> {
     let file = &loaded.value;
-    let format = if file.log.format.as_str() == "json" {
-        LogFormat::Json
-    } else {
-        LogFormat::Text
-    };
+    let format = if file.log.format.as_str() == "json" { LogFormat::Json } else { LogFormat::Text };
     let log = logs::init(file.log.level.as_str(), format)?;
     let settings = WorkerSettings::of(file).map_err(|faults| {
         let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
         anyhow::anyhow!(lines.join("; "))
     })?;
     let (readiness, shown) = (Readiness::new(), Shown::default());
-    let address = shown
-        .serve(file.admin.worker, settings.scope(), readiness.clone(), supervisor)
-        .await?;
+    let address =
+        shown.serve(file.admin.worker, settings.scope(), readiness.clone(), supervisor).await?;
     let worker = Arc::new(begin(settings, file, instance, supervisor).await?);
     shown.set(Arc::clone(&worker));
     let overlays = worker.own().overlays();
-    let told = watch_with(
-        supervisor,
-        sources,
-        schema(),
-        loaded,
-        WatchSettings::default(),
-        overlays,
-    );
+    let told =
+        watch_with(supervisor, sources, schema(), loaded, WatchSettings::default(), overlays);
     let follow = follow_node_file(Arc::clone(&worker), told, log, readiness.clone());
     supervisor.spawn("reload", TaskPolicy::Essential, follow);
     let stop = supervisor.stopping_token();
@@ -183,7 +177,9 @@ async fn begin(
             Arc::new(MemoryHub::new(settings.site.layer.to_string()).broker())
         }
         LocalBroker::Node(section) => open_node(section, &Role::Worker).context("brokers.node")?,
-        LocalBroker::Layer(section) => open_layer(section, &Role::Worker).context("brokers.layer")?,
+        LocalBroker::Layer(section) => {
+            open_layer(section, &Role::Worker).context("brokers.layer")?
+        }
     };
     let keys = settings.keys.as_ref().map(RedisKeys::open).transpose();
     let keys = keys.context("cache")?.map(Arc::new);
@@ -228,19 +224,15 @@ const KEYS: Keys = Keys {
     ],
 };
 
-/// Takes over what may change while the process runs; what is faulty changes nothing and shows on `/readyz`.
+/// Takes over what may change while the process runs; what is faulty changes nothing and shows on
+/// `/readyz`.
 async fn follow_node_file(
     worker: Arc<RunningWorker>,
     told: tokio::sync::watch::Receiver<Current<NodeFile>>,
     log: LogHandle,
     readiness: Readiness,
 ) {
-    let follower = Follower {
-        told,
-        readiness,
-        keys: KEYS,
-        needs_restart,
-    };
+    let follower = Follower { told, readiness, keys: KEYS, needs_restart };
     let take = |loaded: &Loaded<NodeFile>| {
         if let Ok(WorkerSettings { main: Some(main), .. }) = WorkerSettings::of(&loaded.value) {
             worker.set_main(main);
@@ -252,9 +244,11 @@ async fn follow_node_file(
     follow(follower, take, |verdict, besides| worker.own().judged(verdict, besides)).await;
 }
 
-/// Whether a file differs from the one of the start in more than what changes while the process runs.
+/// Whether a file differs from the one of the start in more than what changes while the process
+/// runs.
 fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
-    let (Ok(mut before), Ok(mut after)) = (WorkerSettings::of(started), WorkerSettings::of(file)) else {
+    let (Ok(mut before), Ok(mut after)) = (WorkerSettings::of(started), WorkerSettings::of(file))
+    else {
         return true;
     };
     if before.main.is_some() && after.main.is_some() {

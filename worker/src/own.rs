@@ -1,4 +1,5 @@
-//! The worker's own configuration, as service `blaze-worker`: it has the documents, so it asks nobody.
+//! The worker's own configuration, as service `blaze-worker`: it has the documents, so it asks
+//! nobody.
 //!
 //! ```text
 //! engine ─▶ overlay ─▶ over the node file ─▶ judged ─▶ acknowledgement ─▶ engine, as of any service
@@ -28,7 +29,8 @@ pub struct OwnConfig {
 }
 
 impl OwnConfig {
-    /// Of an instance of the worker on a node; with the part of the engine, and with acknowledgements for [`say_again`].
+    /// Of an instance of the worker on a node; with the part of the engine, and with
+    /// acknowledgements for [`say_again`].
     pub(crate) fn new(
         node: &NodeName,
         instance: InstanceName,
@@ -40,10 +42,7 @@ impl OwnConfig {
         };
         let (tell, overlays) = watch::channel(None);
         let (ack, acks) = watch::channel(None);
-        let of_engine = Own {
-            place: place.clone(),
-            tell,
-        };
+        let of_engine = Own { place: place.clone(), tell };
         Ok((Self { place, overlays, ack }, of_engine, acks))
     }
 
@@ -65,14 +64,18 @@ impl OwnConfig {
         };
         let ack = json!({
             "service": self.place.service, "instance": self.place.instance, "node": self.place.node,
-            "revision": verdict.overlay.revision, "hash": &*verdict.overlay.hash, "status": status.as_str(), "detail": detail,
+            "revision": verdict.overlay.revision, "hash": &*verdict.overlay.hash,
+            "status": status.as_str(), "detail": detail,
         });
         self.ack.send_replace(Some(Bytes::from(ack.to_string())));
     }
 }
 
 /// Says the newest at once and again and again, until the worker ends.
-pub(crate) async fn say_again(mut newest: watch::Receiver<Option<Bytes>>, signs: mpsc::Sender<Sign>) {
+pub(crate) async fn say_again(
+    mut newest: watch::Receiver<Option<Bytes>>,
+    signs: mpsc::Sender<Sign>,
+) {
     loop {
         let ack = newest.borrow_and_update().clone();
         if let Some(ack) = ack

@@ -50,7 +50,8 @@ pub struct WorkerOptions {
     pub keys: Option<Arc<RedisKeys>>,
     /// Folder of the copies; it is made if it is not there. `None`: nothing is kept.
     pub folder: Option<PathBuf>,
-    /// The lease of its layer, which, if it is on a Redis, is on that of the keys; `None`: it is alone.
+    /// The lease of its layer, which, if it is on a Redis, is on that of the keys; `None`: it is
+    /// alone.
     pub lease: Option<Arc<dyn Lease>>,
     /// Its name among the workers of the layer.
     pub worker_id: String,
@@ -83,15 +84,7 @@ impl RunningWorker {
     /// # Errors
     /// A file or folder that it cannot work with.
     pub async fn start(options: WorkerOptions, supervisor: &Supervisor) -> anyhow::Result<Self> {
-        let WorkerOptions {
-            settings,
-            broker,
-            keys,
-            folder,
-            lease,
-            worker_id,
-            instance,
-        } = options;
+        let WorkerOptions { settings, broker, keys, folder, lease, worker_id, instance } = options;
         let vault = Vault::load(settings.key_file.as_deref()).context("worker.key_file")?;
         let (file, database) = kept::open(&settings, folder, &vault).await?;
         let (find, found) = mpsc::channel(COPIES);
@@ -124,7 +117,12 @@ impl RunningWorker {
         let (requests, gets) = mpsc::channel(QUEUE);
         let (said, signs) = mpsc::channel(QUEUE);
         let defaults = match &settings.defaults_file {
-            Some(path) => defaults::watch_file(supervisor, path.clone(), settings.site.layer.clone(), LOOK_AT_FILE),
+            Some(path) => defaults::watch_file(
+                supervisor,
+                path.clone(),
+                settings.site.layer.clone(),
+                LOOK_AT_FILE,
+            ),
             None => watch::channel(defaults::Status::default()).1,
         };
         let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node, instance)?;
@@ -137,9 +135,7 @@ impl RunningWorker {
         let outputs = Outputs {
             replies: Arc::clone(&outlet) as Arc<dyn Replies>,
             speaker: speaker.clone(),
-            channels: outlet
-                .makes_channels()
-                .then(|| Arc::clone(&outlet) as Arc<dyn Channels>),
+            channels: outlet.makes_channels().then(|| Arc::clone(&outlet) as Arc<dyn Channels>),
             copies: copies.clone(),
             acks,
             own: Some(said_of_own),
@@ -175,12 +171,11 @@ impl RunningWorker {
         let listening = listen(Arc::clone(&broker), GET, requests, |payload| payload, hears);
         spawn("requests", Box::pin(listening));
         type Into = fn(Bytes) -> Sign;
-        let heard: [(&str, &str, Into); 2] = [
-            ("acknowledgements", ACK, Sign::Ack),
-            ("watchdogs", WATCHDOG, Sign::Beat),
-        ];
+        let heard: [(&str, &str, Into); 2] =
+            [("acknowledgements", ACK, Sign::Ack), ("watchdogs", WATCHDOG, Sign::Beat)];
         for (name, channel, into) in heard {
-            let listening = listen(Arc::clone(&broker), channel, said.clone(), into, Arc::default());
+            let listening =
+                listen(Arc::clone(&broker), channel, said.clone(), into, Arc::default());
             spawn(name, Box::pin(listening));
         }
         spawn("outages", Box::pin(notice_deafness(broker.status(), said.clone())));
@@ -229,14 +224,19 @@ impl RunningWorker {
         answer.await.ok()
     }
 
-    /// Whether services reach it on its broker: that answers, and what they say there is heard. With words for people.
+    /// Whether services reach it on its broker: that answers, and what they say there is heard.
+    /// With words for people.
     #[must_use]
     pub fn reach(&self) -> (bool, String) {
         let status = self.broker.status().borrow().clone();
         match (status.health, self.hears_requests.load(Ordering::Relaxed)) {
             (Health::Up, true) => (true, status.detail),
-            (Health::Up, false) => (false, format!("{}: requests are not heard yet", status.detail)),
-            (Health::Connecting | Health::Down | Health::InUse | Health::Closed, _) => (false, status.detail),
+            (Health::Up, false) => {
+                (false, format!("{}: requests are not heard yet", status.detail))
+            }
+            (Health::Connecting | Health::Down | Health::InUse | Health::Closed, _) => {
+                (false, status.detail)
+            }
         }
     }
 
@@ -277,22 +277,27 @@ impl RunningWorker {
         if let Some(copies) = &self.copies
             && !copies.flush(KEEP_WITHIN).await
         {
-            tracing::warn!("a copy is behind; the next start gets the rest from the other one or the main service");
+            tracing::warn!(
+                "a copy is behind; the next start gets the rest from the other one or the main \
+                 service"
+            );
         }
         // From now on nothing is told, and the lease is not taken again.
         if let Some(lease) = &self.lease {
             lease.give_up.cancel();
-            if tokio::time::timeout(GIVE_UP_WITHIN, lease.is_given_up.cancelled())
-                .await
-                .is_err()
-            {
+            if tokio::time::timeout(GIVE_UP_WITHIN, lease.is_given_up.cancelled()).await.is_err() {
                 tracing::warn!("the lease was not given up in time; it runs out");
             }
         }
     }
 }
 
-async fn keep_until(lease: Arc<dyn Lease>, time: Duration, mut holder: Holder, give_up: &CancellationToken) {
+async fn keep_until(
+    lease: Arc<dyn Lease>,
+    time: Duration,
+    mut holder: Holder,
+    give_up: &CancellationToken,
+) {
     tokio::select! {
         () = lease::keep(Arc::clone(&lease), time, &mut holder) => {}
         () = give_up.cancelled() => {}
@@ -319,7 +324,9 @@ impl Replies for BrokerOutlet {
 
     fn shared(&self) -> Option<ChannelName> {
         match self.kind() {
-            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => Some(ChannelName::shared_reply()),
+            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => {
+                Some(ChannelName::shared_reply())
+            }
             BrokerKind::Memory | BrokerKind::Redis => None,
         }
     }

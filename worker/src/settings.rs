@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use blaze_domain::Scope;
-use blaze_domain::node_file::{AutoBool, DatabaseSection, Fault, LayerBroker, NodeBroker, NodeFile, RedisBroker};
+use blaze_domain::node_file::{
+    AutoBool, DatabaseSection, Fault, LayerBroker, NodeBroker, NodeFile, RedisBroker,
+};
 
 use crate::core::Site;
 use crate::core::messages::Delivery;
@@ -54,10 +56,7 @@ impl WorkerSettings {
     pub fn of(file: &NodeFile) -> Result<Self, Vec<Fault>> {
         let mut faults = Vec::new();
         let mut missing = |path: &str, detail: &str| {
-            faults.push(Fault {
-                path: path.to_owned(),
-                detail: detail.to_owned(),
-            });
+            faults.push(Fault { path: path.to_owned(), detail: detail.to_owned() });
         };
         let brokers = &file.brokers;
         let broker = match (&brokers.node, &brokers.layer) {
@@ -119,7 +118,11 @@ impl WorkerSettings {
     pub fn keys_on_broker(&self) -> bool {
         match (&self.broker, &self.keys) {
             (LocalBroker::Node(NodeBroker::Redis(broker)), Some(keys)) => broker == keys,
-            (LocalBroker::Node(NodeBroker::Redis(_) | NodeBroker::Memory) | LocalBroker::Layer(_), _) => false,
+            (
+                LocalBroker::Node(NodeBroker::Redis(_) | NodeBroker::Memory)
+                | LocalBroker::Layer(_),
+                _,
+            ) => false,
         }
     }
 
@@ -133,7 +136,8 @@ impl WorkerSettings {
     }
 }
 
-/// `auto`: as text where nobody else reads along. What goes to the keys is readable by whoever reads these.
+/// `auto`: as text where nobody else reads along. What goes to the keys is readable by whoever
+/// reads these.
 fn delivery(wanted: AutoBool, broker: &LocalBroker, keys: Option<&RedisBroker>) -> Delivery {
     let is_private = match broker {
         LocalBroker::Node(NodeBroker::Memory) | LocalBroker::Layer(LayerBroker::Memory) => true,
@@ -180,7 +184,8 @@ mod tests {
     use super::*;
 
     fn settings(rest: Value) -> Result<WorkerSettings, Vec<Fault>> {
-        let mut tree = json!({ "layer": { "name": "edge", "kind": "edge" }, "node": { "name": "robot-1" } });
+        let mut tree =
+            json!({ "layer": { "name": "edge", "kind": "edge" }, "node": { "name": "robot-1" } });
         let Value::Object(rest) = rest else {
             panic!("an object");
         };
@@ -194,14 +199,19 @@ mod tests {
 
     #[test]
     fn the_broker_of_the_node_comes_before_that_of_the_layer() {
-        let both = json!({ "node": { "redis": { "url": "redis://127.0.0.1" } }, "layer": { "memory": {} } });
+        let both = json!({
+            "node": { "redis": { "url": "redis://127.0.0.1" } },
+            "layer": { "memory": {} },
+        });
         let on_node = settings(json!({ "brokers": both })).unwrap();
         assert_eq!(on_node.site.node.as_ref().unwrap().as_str(), "robot-1");
         assert!(on_node.keys_on_broker());
         let on_layer = settings(json!({ "brokers": { "layer": { "memory": {} } } })).unwrap();
         assert_eq!((on_layer.site.node, on_layer.keys), (None, None));
-        let elsewhere =
-            json!({ "brokers": redis("redis://127.0.0.1"), "cache": { "redis": { "url": "redis://10.0.0.1" } } });
+        let elsewhere = json!({
+            "brokers": redis("redis://127.0.0.1"),
+            "cache": { "redis": { "url": "redis://10.0.0.1" } },
+        });
         assert!(!settings(elsewhere).unwrap().keys_on_broker());
     }
 
@@ -230,12 +240,18 @@ mod tests {
                 "{url}"
             );
         }
-        let cache =
-            json!({ "brokers": redis("redis://127.0.0.1"), "cache": { "redis": { "url": "redis://10.0.0.1" } } });
+        let cache = json!({
+            "brokers": redis("redis://127.0.0.1"),
+            "cache": { "redis": { "url": "redis://10.0.0.1" } },
+        });
         assert_eq!(settings(cache).unwrap().delivery, Delivery::Redacted);
-        let forced = json!({ "brokers": redis("redis://10.0.0.1"), "worker": { "deliver_secrets": true } });
+        let forced =
+            json!({ "brokers": redis("redis://10.0.0.1"), "worker": { "deliver_secrets": true } });
         assert_eq!(settings(forced).unwrap().delivery, Delivery::Text);
-        let never = json!({ "brokers": redis("redis://127.0.0.1"), "worker": { "deliver_secrets": false } });
+        let never = json!({
+            "brokers": redis("redis://127.0.0.1"),
+            "worker": { "deliver_secrets": false },
+        });
         assert_eq!(settings(never).unwrap().delivery, Delivery::Redacted);
     }
 }

@@ -33,19 +33,9 @@ pub(crate) enum Way {
 /// A connection; clones share it.
 #[derive(Clone)]
 pub(crate) enum Connection {
-    Etcd {
-        keys: KvClient<Channel>,
-        watch: WatchClient<Channel>,
-    },
-    Grpc {
-        client: ConfigServiceClient<Channel>,
-        token: MetadataValue<Ascii>,
-    },
-    Rest {
-        http: reqwest::Client,
-        base: String,
-        token: String,
-    },
+    Etcd { keys: KvClient<Channel>, watch: WatchClient<Channel> },
+    Grpc { client: ConfigServiceClient<Channel>, token: MetadataValue<Ascii> },
+    Rest { http: reqwest::Client, base: String, token: String },
 }
 
 /// A document as it was read.
@@ -122,10 +112,7 @@ impl Connection {
     pub(crate) async fn get(&mut self, number: usize) -> anyhow::Result<Found> {
         match self {
             Self::Etcd { keys, .. } => {
-                let request = etcd::RangeRequest {
-                    key: key(number),
-                    range_end: Bytes::new(),
-                };
+                let request = etcd::RangeRequest { key: key(number), range_end: Bytes::new() };
                 let mut kvs = keys.range(request).await?.into_inner().kvs;
                 let one = kvs.pop().with_context(|| format!("no {}", name(number)))?;
                 anyhow::ensure!(
@@ -133,32 +120,20 @@ impl Connection {
                     "{:?} was not asked for",
                     one.key
                 );
-                Ok(Found {
-                    revision: one.mod_revision.try_into()?,
-                    body: Body::Spec(one.value),
-                })
+                Ok(Found { revision: one.mod_revision.try_into()?, body: Body::Spec(one.value) })
             }
             Self::Grpc { client, token } => {
-                let request = v1::GetRequest {
-                    r#ref: Some(reference(number)),
-                    read: None,
-                };
+                let request = v1::GetRequest { r#ref: Some(reference(number)), read: None };
                 let one = client.get(signed(request, token)).await?.into_inner();
                 let named = one.r#ref.context("no ref")?.name;
                 anyhow::ensure!(named == name(number), "{named} was not asked for");
-                Ok(Found {
-                    revision: one.revision,
-                    body: Body::Spec(one.spec_json.into()),
-                })
+                Ok(Found { revision: one.revision, body: Body::Spec(one.spec_json.into()) })
             }
             Self::Rest { http, base, token } => {
                 let url = format!("{base}/services/{}", name(number));
                 let response = http.get(url).bearer_auth(token).send().await?;
                 let (revision, body) = answer(response).await?;
-                Ok(Found {
-                    revision,
-                    body: Body::Envelope(body),
-                })
+                Ok(Found { revision, body: Body::Envelope(body) })
             }
         }
     }
@@ -219,10 +194,8 @@ impl Connection {
                     ..v1::ApplyRequest::default()
                 };
                 let answer = client.apply(signed(request, token)).await?.into_inner();
-                let done = answer
-                    .results
-                    .iter()
-                    .filter(|result| result.revision == answer.revision);
+                let done =
+                    answer.results.iter().filter(|result| result.revision == answer.revision);
                 let done = done.count();
                 anyhow::ensure!(done == count, "{done} of {count} were applied");
                 Ok(answer.revision)
@@ -280,10 +253,7 @@ fn key(number: usize) -> Bytes {
 }
 
 fn put_request(number: usize, spec: String) -> etcd::PutRequest {
-    etcd::PutRequest {
-        key: key(number),
-        value: spec.into(),
-    }
+    etcd::PutRequest { key: key(number), value: spec.into() }
 }
 
 fn header_revision(header: Option<&etcd::ResponseHeader>) -> anyhow::Result<u64> {
@@ -291,19 +261,11 @@ fn header_revision(header: Option<&etcd::ResponseHeader>) -> anyhow::Result<u64>
 }
 
 fn reference(number: usize) -> v1::Ref {
-    v1::Ref {
-        kind: v1::Kind::Service.into(),
-        name: name(number),
-        service: String::new(),
-    }
+    v1::Ref { kind: v1::Kind::Service.into(), name: name(number), service: String::new() }
 }
 
 fn document(number: usize, spec: String) -> v1::Document {
-    v1::Document {
-        r#ref: Some(reference(number)),
-        spec_json: spec,
-        ..v1::Document::default()
-    }
+    v1::Document { r#ref: Some(reference(number)), spec_json: spec, ..v1::Document::default() }
 }
 
 fn signed<T>(message: T, token: &MetadataValue<Ascii>) -> Request<T> {

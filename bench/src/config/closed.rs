@@ -59,16 +59,8 @@ pub(crate) async fn run(
             check(&mut connection, &subject.documents, number, true).await?;
         }
     }
-    anyhow::ensure!(
-        !latencies.is_empty(),
-        "nothing was done in the window: measure for longer"
-    );
-    Ok(Measured {
-        operations: latencies.len(),
-        time: timing.measured,
-        latencies,
-        used,
-    })
+    anyhow::ensure!(!latencies.is_empty(), "nothing was done in the window: measure for longer");
+    Ok(Measured { operations: latencies.len(), time: timing.measured, latencies, used })
 }
 
 /// One request after another; the latencies of those that ended in the window, in nanoseconds.
@@ -83,13 +75,8 @@ async fn one(
     loop {
         let took = match work {
             Work::Get => {
-                check(
-                    &mut connection,
-                    &documents,
-                    documents.any(),
-                    count.is_multiple_of(SAMPLE),
-                )
-                .await?
+                check(&mut connection, &documents, documents.any(), count.is_multiple_of(SAMPLE))
+                    .await?
             }
             Work::Put => put(&mut connection, &documents).await?,
             Work::Apply => apply(&mut connection, &documents, &documents.some(APPLIED)).await?,
@@ -104,7 +91,8 @@ async fn one(
     }
 }
 
-/// Reads a document that nobody writes now: it must have what was acknowledged last. The time that reading took.
+/// Reads a document that nobody writes now: it must have what was acknowledged last. The time that
+/// reading took.
 async fn check(
     connection: &mut Connection,
     documents: &Documents,

@@ -28,10 +28,7 @@ pub(crate) struct Documents {
 
 impl Documents {
     pub(crate) fn new(count: u64) -> Self {
-        Self {
-            known: (0..count).map(|_| Mutex::default()).collect(),
-            next_step: AtomicU64::new(1),
-        }
+        Self { known: (0..count).map(|_| Mutex::default()).collect(), next_step: AtomicU64::new(1) }
     }
 
     pub(crate) fn count(&self) -> usize {

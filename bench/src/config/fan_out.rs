@@ -1,4 +1,5 @@
-//! Changes at a rate, and how long each takes to every watcher: from before it is sent to its reception, by one clock.
+//! Changes at a rate, and how long each takes to every watcher: from before it is sent to its
+//! reception, by one clock.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -14,7 +15,8 @@ use super::figures::{Measured, Timing};
 use super::subject::Subject;
 use super::watches::Watch;
 
-/// Changes that may wait for their answer; at the rates that are asked for there is hardly ever a second one.
+/// Changes that may wait for their answer; at the rates that are asked for there is hardly ever a
+/// second one.
 const UNDER_WAY: usize = 64;
 /// For what is on the way at the end.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -34,9 +36,7 @@ impl Sent {
 
     /// Which change of this measurement a step is.
     fn index(&self, step: u64) -> anyhow::Result<usize> {
-        let index = step
-            .checked_sub(self.first_step)
-            .context("a change from before the watch")?;
+        let index = step.checked_sub(self.first_step).context("a change from before the watch")?;
         let index = usize::try_from(index)?;
         anyhow::ensure!(index < self.times.len(), "a change that nobody made: step {step}");
         Ok(index)
@@ -75,12 +75,7 @@ pub(crate) async fn run(
         tasks.spawn(one(connection, watch, Arc::clone(&sent), before));
     }
     let mut writing = JoinSet::new();
-    writing.spawn(write_all(
-        writer,
-        Arc::clone(&subject.documents),
-        Arc::clone(&sent),
-        period,
-    ));
+    writing.spawn(write_all(writer, Arc::clone(&subject.documents), Arc::clone(&sent), period));
     let used = subject.used_in(window).await?;
     let mut latencies = Vec::with_capacity(watchers * counted);
     let ended = async {
@@ -92,16 +87,9 @@ pub(crate) async fn run(
         }
         anyhow::Ok(())
     };
-    timeout(PATIENCE, ended)
-        .await
-        .context("a watcher was not told of all changes")??;
+    timeout(PATIENCE, ended).await.context("a watcher was not told of all changes")??;
     anyhow::ensure!(latencies.len() == watchers * counted, "{} latencies", latencies.len());
-    Ok(Measured {
-        operations: counted,
-        time: timing.measured,
-        latencies,
-        used,
-    })
+    Ok(Measured { operations: counted, time: timing.measured, latencies, used })
 }
 
 async fn write_all(
@@ -123,7 +111,8 @@ async fn write_all(
         while let Some(done) = writes.try_join_next() {
             done??;
         }
-        let (mut connection, documents, sent) = (connection.clone(), Arc::clone(&documents), Arc::clone(&sent));
+        let (mut connection, documents, sent) =
+            (connection.clone(), Arc::clone(&documents), Arc::clone(&sent));
         let (number, step) = (documents.any(), documents.next_step());
         writes.spawn(async move {
             let text = spec(number, step);
@@ -139,14 +128,23 @@ async fn write_all(
     Ok(())
 }
 
-/// One watcher: latencies in nanoseconds, without those of the first `before` changes. The connection lives as long.
-async fn one(_connection: Connection, mut watch: Watch, sent: Arc<Sent>, before: usize) -> anyhow::Result<Vec<u64>> {
+/// One watcher: latencies in nanoseconds, without those of the first `before` changes. The
+/// connection lives as long.
+async fn one(
+    _connection: Connection,
+    mut watch: Watch,
+    sent: Arc<Sent>,
+    before: usize,
+) -> anyhow::Result<Vec<u64>> {
     let mut latencies: Vec<Option<u64>> = vec![None; sent.times.len()];
     let (mut left, mut last_revision) = (latencies.len(), 0);
     while left > 0 {
         for told in watch.next().await? {
             let now = sent.now()?;
-            anyhow::ensure!(told.revision > last_revision, "{told:?} after revision {last_revision}");
+            anyhow::ensure!(
+                told.revision > last_revision,
+                "{told:?} after revision {last_revision}"
+            );
             last_revision = told.revision;
             let index = sent.index(told.step)?;
             let begun = sent.times[index].load(Ordering::Acquire);

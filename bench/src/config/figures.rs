@@ -26,19 +26,13 @@ pub(crate) struct Window {
 impl Timing {
     /// One of several turns.
     pub(crate) fn turn(&self, turns: u32) -> Self {
-        Self {
-            measured: self.measured / turns,
-            ..*self
-        }
+        Self { measured: self.measured / turns, ..*self }
     }
 
     /// The window of a load that begins now.
     pub(crate) fn window(&self) -> Window {
         let begin = Instant::now() + self.warm_up;
-        Window {
-            begin,
-            end: begin + self.measured,
-        }
+        Window { begin, end: begin + self.measured }
     }
 }
 
@@ -88,7 +82,8 @@ impl Figures {
     pub(crate) fn of(operations: usize, window: Duration, mut latencies: Vec<u64>) -> Self {
         latencies.sort_unstable();
         let quantile = |q: f64| {
-            let index = ((latencies.len() as f64 * q) as usize).min(latencies.len().saturating_sub(1));
+            let index =
+                ((latencies.len() as f64 * q) as usize).min(latencies.len().saturating_sub(1));
             latencies.get(index).copied().unwrap_or_default() as f64 / 1e6
         };
         Self {
@@ -153,7 +148,8 @@ impl std::fmt::Display for Bar {
 impl Row {
     pub(crate) fn new(round: usize, load: &Load, subject: &str, measured: Measured) -> Self {
         let (figures, used) = measured.figures();
-        let per_operation = |time: Duration| time.as_secs_f64() * 1e6 / figures.operations.max(1) as f64;
+        let per_operation =
+            |time: Duration| time.as_secs_f64() * 1e6 / figures.operations.max(1) as f64;
         Self {
             round,
             load: load.name(),

@@ -32,10 +32,7 @@ impl Load {
     pub(crate) fn all(connections: &[usize], watchers: usize, rate_hz: f64) -> Vec<Self> {
         let each = |work| {
             let count = connections.iter();
-            count.map(move |connections| Self::Closed {
-                work,
-                connections: *connections,
-            })
+            count.map(move |connections| Self::Closed { work, connections: *connections })
         };
         let closed = [Work::Get, Work::Put, Work::Apply].into_iter().flat_map(each);
         closed.chain([Self::FanOut { watchers, rate_hz }]).collect()
@@ -62,10 +59,19 @@ impl Load {
         }
     }
 
-    pub(crate) async fn run(&self, subject: &Subject, way: &Way, timing: &Timing) -> anyhow::Result<Measured> {
+    pub(crate) async fn run(
+        &self,
+        subject: &Subject,
+        way: &Way,
+        timing: &Timing,
+    ) -> anyhow::Result<Measured> {
         match *self {
-            Self::Closed { work, connections } => closed::run(work, connections, subject, way, timing).await,
-            Self::FanOut { watchers, rate_hz } => fan_out::run(watchers, rate_hz, subject, way, timing).await,
+            Self::Closed { work, connections } => {
+                closed::run(work, connections, subject, way, timing).await
+            }
+            Self::FanOut { watchers, rate_hz } => {
+                fan_out::run(watchers, rate_hz, subject, way, timing).await
+            }
         }
     }
 }

@@ -1,4 +1,5 @@
-//! BlazeConfig beside etcd: the same documents, the same load generator, the same disk, in one run on one machine.
+//! BlazeConfig beside etcd: the same documents, the same load generator, the same disk, in one run
+//! on one machine.
 //!
 //! ```text
 //! connections ──gRPC──▶ etcd                          │ one under load at a time, in turns:
@@ -8,9 +9,10 @@
 //!                                         rates, latencies, CPU times from /proc
 //! ```
 //!
-//! Every answer is checked: a GET must give the revision that was acknowledged last, a sample of them the whole content,
-//! and what was written is read again. Needs `scripts/services install`, and is meant for release builds:
-//! `cargo build --release --workspace --bins && target/release/blaze-bench config`.
+//! Every answer is checked: a GET must give the revision that was acknowledged last, a sample of
+//! them the whole content, and what was written is read again. Needs `scripts/services install`,
+//! and is meant for release builds: `cargo build --release --workspace --bins &&
+//! target/release/blaze-bench config`.
 
 mod clients;
 mod closed;
@@ -60,15 +62,16 @@ pub(crate) struct Arguments {
     /// Seconds of load before each turn of a measurement
     #[arg(long, default_value_t = 0.5)]
     warm_up: f64,
-    /// Turns in which each measurement is made, by etcd and who is beside it alternately: what slows the machine for seconds
-    /// slows both
+    /// Turns in which each measurement is made, by etcd and who is beside it alternately: what
+    /// slows the machine for seconds slows both
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100))]
     turns: u32,
     /// How often everything is measured; medians are judged
     #[arg(long, default_value_t = 1)]
     rounds: usize,
     /// Documents in each store, at least 100
-    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(100..=100_000))]
+    #[arg(long, default_value_t = 10_000,
+        value_parser = clap::value_parser!(u64).range(100..=100_000))]
     documents: u64,
     /// Connections, each with one request at a time
     #[arg(long, value_delimiter = ',', default_value = "1,16,64")]
@@ -109,8 +112,7 @@ impl Arguments {
 
     fn contenders(&self) -> Vec<Contender> {
         let all = Contender::ALL.into_iter();
-        all.filter(|contender| contender.name().contains(&self.beside))
-            .collect()
+        all.filter(|contender| contender.name().contains(&self.beside)).collect()
     }
 }
 
@@ -146,10 +148,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let contenders = arguments.contenders();
     anyhow::ensure!(!contenders.is_empty(), "nobody is called {:?}", arguments.beside);
     let loads = Load::all(&arguments.connections, arguments.watchers, arguments.rate);
-    let loads: Vec<Load> = loads
-        .into_iter()
-        .filter(|load| load.name().contains(&arguments.only))
-        .collect();
+    let loads: Vec<Load> =
+        loads.into_iter().filter(|load| load.name().contains(&arguments.only)).collect();
     anyhow::ensure!(!loads.is_empty(), "no load is called {:?}", arguments.only);
 
     let parent = match &arguments.data {
@@ -168,7 +168,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         .into_iter()
         .filter(|store| contenders.iter().any(|contender| contender.store == *store))
         .collect();
-    let subjects = Subjects::start(folder.path(), &stores, arguments.documents, arguments.second_process)?;
+    let subjects =
+        Subjects::start(folder.path(), &stores, arguments.documents, arguments.second_process)?;
     runtime.block_on(async {
         for subject in subjects.all() {
             subject.fill().await?;
@@ -223,7 +224,12 @@ async fn measure(
 }
 
 /// One turn. What it began has ended after it: else the next one would be measured beside it.
-async fn one(load: &Load, name: &str, (subject, way): &(&Subject, Way), timing: &Timing) -> anyhow::Result<Measured> {
+async fn one(
+    load: &Load,
+    name: &str,
+    (subject, way): &(&Subject, Way),
+    timing: &Timing,
+) -> anyhow::Result<Measured> {
     let before = open_sockets()?;
     let measured = load.run(subject, way, timing).await;
     let measured = measured.with_context(|| format!("{} of {name}", load.name()))?;

@@ -41,12 +41,7 @@ struct Median {
 
 impl Report {
     pub(crate) fn new(machine: Machine, etcd: String) -> Self {
-        Self {
-            machine,
-            etcd,
-            memory: Vec::new(),
-            rows: Vec::new(),
-        }
+        Self { machine, etcd, memory: Vec::new(), rows: Vec::new() }
     }
 
     pub(crate) fn print_machine(&self) {
@@ -103,7 +98,8 @@ impl Report {
     fn medians(&self) -> Vec<Median> {
         let mut medians: Vec<Median> = Vec::new();
         for row in &self.rows {
-            let is_known = |median: &Median| median.load == row.load && median.subject == row.subject;
+            let is_known =
+                |median: &Median| median.load == row.load && median.subject == row.subject;
             if row.to_etcd.is_none() || medians.iter().any(is_known) {
                 continue;
             }
@@ -112,7 +108,8 @@ impl Report {
                 .iter()
                 .filter(|other| other.load == row.load && other.subject == row.subject)
                 .collect();
-            let middle = |value: fn(&Row) -> f64| median(same.iter().map(|row| value(row)).collect());
+            let middle =
+                |value: fn(&Row) -> f64| median(same.iter().map(|row| value(row)).collect());
             let to_etcd = middle(|row| row.to_etcd.unwrap_or(f64::NAN));
             // REST is shown, and not judged.
             let bar = row.bar.filter(|_| row.subject.contains("grpc"));
@@ -140,7 +137,12 @@ impl Report {
             };
             println!(
                 "{:<22} {:<19} {:>9.0} {:>9.3} {:>9.3} {:>7.2}  {judged}",
-                median.load, median.subject, median.rate_hz, median.p50_ms, median.p99_ms, median.to_etcd
+                median.load,
+                median.subject,
+                median.rate_hz,
+                median.p50_ms,
+                median.p99_ms,
+                median.to_etcd
             );
         }
     }
@@ -160,10 +162,7 @@ impl Report {
             report: &'a Report,
             medians: Vec<Median>,
         }
-        let whole = Whole {
-            report: self,
-            medians: self.medians(),
-        };
+        let whole = Whole { report: self, medians: self.medians() };
         std::fs::write(path, serde_json::to_string_pretty(&whole)? + "\n")?;
         Ok(())
     }

@@ -22,7 +22,8 @@ use super::load::APPLIED;
 
 /// A start on a machine that does much else; measured below a second.
 const START: Duration = Duration::from_secs(60);
-/// etcd refuses writes above 2 GiB by default, which a long run may reach: nothing is compacted, as nothing is trimmed.
+/// etcd refuses writes above 2 GiB by default, which a long run may reach: nothing is compacted, as
+/// nothing is trimmed.
 const ETCD_BYTES: &str = "--quota-backend-bytes=34359738368";
 
 /// Where BlazeConfig keeps documents.
@@ -87,9 +88,8 @@ impl Used {
         self.server += other.server;
         self.database = sum(self.database, other.database, |one, other| one + other);
         self.client += other.client;
-        self.written = sum(self.written, other.written, |one, other| {
-            (one.0 + other.0, one.1 + other.1)
-        });
+        self.written =
+            sum(self.written, other.written, |one, other| (one.0 + other.0, one.1 + other.1));
         self.aborts = sum(self.aborts, other.aborts, |one, other| one + other);
     }
 
@@ -117,11 +117,17 @@ struct Sample {
 }
 
 impl Subjects {
-    /// Starts etcd and a main service on each store, all with data in one folder; on MongoDB a second one if that is wanted.
+    /// Starts etcd and a main service on each store, all with data in one folder; on MongoDB a
+    /// second one if that is wanted.
     ///
     /// # Errors
     /// When one is not there or does not start.
-    pub(crate) fn start(folder: &Path, stores: &[Store], documents: u64, second: bool) -> anyhow::Result<Self> {
+    pub(crate) fn start(
+        folder: &Path,
+        stores: &[Store],
+        documents: u64,
+        second: bool,
+    ) -> anyhow::Result<Self> {
         let etcd = EtcdServer::start(EtcdOptions {
             folder: Some(folder.to_owned()),
             extra: vec![ETCD_BYTES.to_owned()],
@@ -149,35 +155,29 @@ impl Subjects {
     /// # Errors
     /// When it was not started.
     pub(crate) fn of(&self, store: Store) -> anyhow::Result<&Subject> {
-        let is_it = |subject: &&Subject| matches!(&subject.server, Server::Blaze(blaze) if blaze.store == store);
-        self.0
-            .iter()
-            .find(is_it)
-            .with_context(|| format!("no {}", store.name()))
+        let is_it = |subject: &&Subject| {
+            matches!(
+                &subject.server,
+                Server::Blaze(blaze) if blaze.store == store,
+            )
+        };
+        self.0.iter().find(is_it).with_context(|| format!("no {}", store.name()))
     }
 }
 
 impl Subject {
     fn new(name: &str, documents: u64, server: Server) -> Self {
-        Self {
-            name: name.to_owned(),
-            documents: Arc::new(Documents::new(documents)),
-            server,
-        }
+        Self { name: name.to_owned(), documents: Arc::new(Documents::new(documents)), server }
     }
 
     /// How it is reached; etcd has no REST.
     pub(crate) fn way(&self, rest: bool) -> Way {
         match &self.server {
             Server::Etcd(etcd) => Way::Etcd(etcd.address()),
-            Server::Blaze(blaze) if rest => Way::Rest {
-                at: blaze.rest,
-                token: blaze.token.clone(),
-            },
-            Server::Blaze(blaze) => Way::Grpc {
-                at: blaze.grpc,
-                token: blaze.token.clone(),
-            },
+            Server::Blaze(blaze) if rest => {
+                Way::Rest { at: blaze.rest, token: blaze.token.clone() }
+            }
+            Server::Blaze(blaze) => Way::Grpc { at: blaze.grpc, token: blaze.token.clone() },
         }
     }
 
@@ -218,7 +218,9 @@ impl Subject {
         let before = block_in_place(|| self.sample())?;
         sleep_until(window.end.into()).await;
         let after = block_in_place(|| self.sample())?;
-        let between = |before: Option<Duration>, after: Option<Duration>| Some(after?.saturating_sub(before?));
+        let between = |before: Option<Duration>, after: Option<Duration>| {
+            Some(after?.saturating_sub(before?))
+        };
         let written = match (before.written, after.written) {
             (Some(before), Some(after)) => Some((after.0 - before.0, after.1 - before.1)),
             _ => None,
@@ -246,7 +248,8 @@ impl Subject {
             Server::Blaze(blaze) => {
                 let server = cpu_time(blaze.process.id())?;
                 let mongo = blaze.mongo.as_ref();
-                let database = mongo.map(|mongo| cpu_time(mongo.pid().context("mongod has ended")?));
+                let database =
+                    mongo.map(|mongo| cpu_time(mongo.pid().context("mongod has ended")?));
                 Ok(Sample {
                     server,
                     database: database.transpose()?,
@@ -293,10 +296,7 @@ impl Blaze {
         let node_file = write_node_file(&folder, &key_file, &store_section)?;
         let token = token(key.as_bytes())?;
 
-        let arguments = [
-            "--config",
-            node_file.to_str().context("the folder has a name in UTF-8")?,
-        ];
+        let arguments = ["--config", node_file.to_str().context("the folder has a name in UTF-8")?];
         let start = || {
             let process = Process::start("blaze-config", &arguments, None)?;
             process.ready_at("admin", START)?;
@@ -308,10 +308,7 @@ impl Blaze {
             store,
             rest: at("rest")?,
             grpc: at("grpc")?,
-            admin: Admin {
-                address: at("admin")?,
-                namespace: None,
-            },
+            admin: Admin { address: at("admin")?, namespace: None },
             process,
             _second: second,
             mongo,
@@ -321,11 +318,8 @@ impl Blaze {
 
     /// Revisions, and transactions, since its start.
     fn written(&self) -> anyhow::Result<(f64, f64)> {
-        let metric = |name: &str| {
-            self.admin
-                .metric(name, &[])
-                .with_context(|| format!("no metric {name}"))
-        };
+        let metric =
+            |name: &str| self.admin.metric(name, &[]).with_context(|| format!("no metric {name}"));
         Ok((
             metric("blaze_config_revision")?,
             metric("blaze_config_commit_duration_seconds_count")?,

@@ -39,24 +39,19 @@ impl Watch {
         let request = etcd::WatchRequest {
             request_union: Some(etcd::watch_request::RequestUnion::CreateRequest(create)),
         };
-        // It ends with the requests. If they went on for ever, so would the watch and its connection, and etcd would have more
-        // watchers from one measurement to the next.
+        // It ends with the requests. If they went on for ever, so would the watch and its
+        // connection, and etcd would have more watchers from one measurement to the next.
         let (open, closed) = oneshot::channel();
-        let requests = iter([request]).chain(closed.into_stream().filter_map(|_: Result<Infallible, _>| ready(None)));
+        let requests = iter([request])
+            .chain(closed.into_stream().filter_map(|_: Result<Infallible, _>| ready(None)));
         let mut stream = client.watch(requests).await?.into_inner();
         let first = stream.message().await?.context("the watch has ended")?;
         anyhow::ensure!(first.created && !first.canceled, "no watch: {}", first.cancel_reason);
-        Ok(Self::Etcd {
-            told: stream,
-            _open: open,
-        })
+        Ok(Self::Etcd { told: stream, _open: open })
     }
 
     pub(crate) fn of_rest(response: reqwest::Response) -> Self {
-        Self::Rest(Events {
-            response,
-            lines: Lines::default(),
-        })
+        Self::Rest(Events { response, lines: Lines::default() })
     }
 
     /// What it tells next; nothing if it only says that it lives.
@@ -95,7 +90,8 @@ impl Watch {
 }
 
 fn known(revision: u64, spec: &[u8]) -> anyhow::Result<Known> {
-    let step = step_of(spec).with_context(|| format!("no step in {:?}", String::from_utf8_lossy(spec)))?;
+    let step =
+        step_of(spec).with_context(|| format!("no step in {:?}", String::from_utf8_lossy(spec)))?;
     Ok(Known { revision, step })
 }
 
@@ -105,7 +101,8 @@ pub(crate) struct Events {
     lines: Lines,
 }
 
-/// Lines from pieces that end anywhere. Each change of this program's is one document, so its step is enough.
+/// Lines from pieces that end anywhere. Each change of this program's is one document, so its step
+/// is enough.
 #[derive(Default)]
 struct Lines {
     rest: Vec<u8>,
@@ -142,15 +139,11 @@ mod tests {
             b"retry: 2731\n\nid: 4\nevent: change\ndata: {\"a\":{\"step\":17,\"b\":1}}\n\nid: 5\nevent: bookmark\n\
                      data: {\"revision\":5}\n\nid: 6\nevent: change\ndata: {\"step\":18}\n\n";
         let whole = Lines::default().push(&Bytes::from_static(text)).unwrap();
-        assert_eq!(
-            whole,
-            [Known { revision: 4, step: 17 }, Known { revision: 6, step: 18 }]
-        );
+        assert_eq!(whole, [Known { revision: 4, step: 17 }, Known { revision: 6, step: 18 }]);
         for size in 1..text.len() {
             let mut lines = Lines::default();
-            let pieces = text
-                .chunks(size)
-                .flat_map(|piece| lines.push(&Bytes::from_static(piece)).unwrap());
+            let pieces =
+                text.chunks(size).flat_map(|piece| lines.push(&Bytes::from_static(piece)).unwrap());
             assert_eq!(pieces.collect::<Vec<_>>(), whole, "{size}");
         }
     }

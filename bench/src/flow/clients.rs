@@ -88,10 +88,7 @@ impl KafkaSource {
             .set("message.max.bytes", "17825792")
             .set("socket.nagle.disable", "true")
             .create()?;
-        Ok(Self {
-            producer,
-            topic: topic.to_owned(),
-        })
+        Ok(Self { producer, topic: topic.to_owned() })
     }
 }
 
@@ -102,7 +99,8 @@ impl Source for KafkaSource {
             match self.producer.send(record) {
                 Ok(()) => break,
                 Err((error, back))
-                    if error.rdkafka_error_code() == Some(rdkafka::types::RDKafkaErrorCode::QueueFull) =>
+                    if error.rdkafka_error_code()
+                        == Some(rdkafka::types::RDKafkaErrorCode::QueueFull) =>
                 {
                     record = back;
                     self.producer.poll(Duration::from_millis(1));

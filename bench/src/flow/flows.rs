@@ -28,7 +28,8 @@ pub(crate) struct Flows {
 }
 
 impl Flows {
-    /// Starts the flows, advertises and requests as plain clients do, and waits until the bridges are up.
+    /// Starts the flows, advertises and requests as plain clients do, and waits until the bridges
+    /// are up.
     pub(crate) fn start(route: &Route<'_>) -> anyhow::Result<Self> {
         let specs = if route.two {
             let domain = free_domain()?;
@@ -65,7 +66,12 @@ impl Flows {
     }
 
     fn connect(&self, route: &Route<'_>) -> anyhow::Result<()> {
-        let terms = json!({"topic": route.topic, "service": "bench", "reliability": "reliable", "ttl_s": 0});
+        let terms = json!({
+            "topic": route.topic,
+            "service": "bench",
+            "reliability": "reliable",
+            "ttl_s": 0,
+        });
         let lease = |op: &str| {
             let mut lease = terms.clone();
             lease["op"] = json!(op);
@@ -89,22 +95,18 @@ impl Flows {
         let mut reasons: BTreeMap<String, f64> = BTreeMap::new();
         for flow in &self.running {
             let (_, metrics) = flow.admin().get("/metrics")?;
-            for line in metrics
-                .lines()
-                .filter(|line| line.starts_with("blaze_flow_dropped_total{"))
+            for line in metrics.lines().filter(|line| line.starts_with("blaze_flow_dropped_total{"))
             {
                 let (labels, value) = line.rsplit_once(' ').context("a metric without a value")?;
-                let (_, reason) = labels.split_once("reason=\"").context("a metric without a reason")?;
-                *reasons
-                    .entry(reason.trim_end_matches(['"', '}']).to_owned())
-                    .or_default() += value.parse::<f64>()?;
+                let (_, reason) =
+                    labels.split_once("reason=\"").context("a metric without a reason")?;
+                *reasons.entry(reason.trim_end_matches(['"', '}']).to_owned()).or_default() +=
+                    value.parse::<f64>()?;
             }
         }
         reasons.retain(|_, count| *count > 0.0);
-        let texts: Vec<String> = reasons
-            .iter()
-            .map(|(reason, count)| format!("{reason} {count}"))
-            .collect();
+        let texts: Vec<String> =
+            reasons.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
         Ok(texts.join(", "))
     }
 

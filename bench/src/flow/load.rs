@@ -12,7 +12,8 @@ const HEAD_BYTES: usize = 17;
 const WARM_UP: Duration = Duration::from_secs(1);
 /// After the last message was sent: what is on the way may still arrive.
 const DRAIN: Duration = Duration::from_secs(5);
-/// Messages on the way at full speed, in bytes: enough to keep every stage busy, too few to overrun any queue.
+/// Messages on the way at full speed, in bytes: enough to keep every stage busy, too few to overrun
+/// any queue.
 const WINDOW_BYTES: u64 = 2 * 1024 * 1024;
 /// And messages: fewer than a flow holds for one topic that comes faster than it can be read.
 const WINDOW_MESSAGES: u64 = 2_048;
@@ -124,13 +125,11 @@ pub(crate) fn run(
     let sent = sender.sent - first;
     seen.end.store(true, Ordering::Relaxed);
     let latencies = reader.join().map_err(|_| anyhow::anyhow!("the sink panicked"))??;
-    let mut mine: Vec<u32> = latencies
-        .iter()
-        .filter(|(number, _)| *number > first)
-        .map(|(_, us)| *us)
-        .collect();
+    let mut mine: Vec<u32> =
+        latencies.iter().filter(|(number, _)| *number > first).map(|(_, us)| *us).collect();
     mine.sort_unstable();
-    let quantile = |q: f64| mine.get(((mine.len() as f64 * q) as usize).min(mine.len().saturating_sub(1)));
+    let quantile =
+        |q: f64| mine.get(((mine.len() as f64 * q) as usize).min(mine.len().saturating_sub(1)));
     Ok(Figures {
         sent,
         lost: sent.saturating_sub(mine.len() as u64),
@@ -167,7 +166,10 @@ impl Sender<'_> {
             self.one()?;
             self.source.flush()?;
             std::thread::sleep(Duration::from_millis(20));
-            anyhow::ensure!(begin.elapsed() < Duration::from_secs(20), "nothing arrives within 20 s");
+            anyhow::ensure!(
+                begin.elapsed() < Duration::from_secs(20),
+                "nothing arrives within 20 s"
+            );
         }
         Ok(())
     }
@@ -191,9 +193,8 @@ impl Sender<'_> {
             self.source.flush()?;
             let next = begin + Duration::from_secs_f64(count as f64 / rate);
             // A thread that wakes for every message at 10,000 Hz would measure itself.
-            let pause = next
-                .saturating_duration_since(Instant::now())
-                .max(Duration::from_micros(500));
+            let pause =
+                next.saturating_duration_since(Instant::now()).max(Duration::from_micros(500));
             std::thread::sleep(pause);
         }
         Ok(())
@@ -230,7 +231,10 @@ impl Sender<'_> {
     fn drained(&self) {
         let begin = Instant::now();
         let mut last = (Instant::now(), self.seen.received.load(Ordering::Relaxed));
-        while begin.elapsed() < DRAIN && last.0.elapsed() < Duration::from_millis(500) && last.1 < self.sent {
+        while begin.elapsed() < DRAIN
+            && last.0.elapsed() < Duration::from_millis(500)
+            && last.1 < self.sent
+        {
             std::thread::sleep(Duration::from_millis(5));
             let received = self.seen.received.load(Ordering::Relaxed);
             if received != last.1 {

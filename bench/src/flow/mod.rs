@@ -1,5 +1,6 @@
-//! What a hop costs: Redis alone, Kafka alone, Redis to Kafka on one flow, Redis over DDS to Kafka on two flows, the same where the limit
-//! leaves room for some of the messages only, all in one run on one machine.
+//! What a hop costs: Redis alone, Kafka alone, Redis to Kafka on one flow, Redis over DDS to Kafka
+//! on two flows, the same where the limit leaves room for some of the messages only, all in one run
+//! on one machine.
 //!
 //! ```text
 //! source (plain client) ─► server ─► blaze-flow … ─► server ─► sink (plain client): latency, loss, rate
@@ -64,13 +65,8 @@ const UNLIMITED_MBPS: f64 = 20_000.0;
 const ROOM: f64 = 0.6;
 
 impl PathKind {
-    const ALL: [Self; 5] = [
-        Self::RedisAlone,
-        Self::KafkaAlone,
-        Self::OneFlow,
-        Self::TwoFlows,
-        Self::Limited,
-    ];
+    const ALL: [Self; 5] =
+        [Self::RedisAlone, Self::KafkaAlone, Self::OneFlow, Self::TwoFlows, Self::Limited];
 
     /// Whether it can be measured under a load: a limit is one of a rate.
     fn takes(self, load: Load) -> bool {
@@ -113,10 +109,7 @@ pub(crate) fn run(arguments: Arguments) -> anyhow::Result<()> {
         "{:<27} {:<22} {:>9} {:>8} {:>9} {:>9} {:>9} {:>13}  DROPPED",
         "PATH", "LOAD", "SENT", "LOST", "MSG/S", "p50/ms", "p99/ms", "FLOW us/MSG"
     );
-    for kind in PathKind::ALL
-        .into_iter()
-        .filter(|kind| kind.name().contains(&arguments.only))
-    {
+    for kind in PathKind::ALL.into_iter().filter(|kind| kind.name().contains(&arguments.only)) {
         for load in Load::all()
             .into_iter()
             .filter(|load| kind.takes(*load) && load.name().contains(&arguments.load))

@@ -1,7 +1,9 @@
-//! What a fleet costs one flow: how long it plans, and what it has to tell, with 10, 100 and 1,000 other nodes of 50 topics each.
+//! What a fleet costs one flow: how long it plans, and what it has to tell, with 10, 100 and 1,000
+//! other nodes of 50 topics each.
 //!
-//! All of them announce themselves to one flow by the code of production, over a network that loses nothing and takes no time. That
-//! flow plans for itself, or as a gateway that speaks for a flow of its layer as well: then it tells that one of all the others.
+//! All of them announce themselves to one flow by the code of production, over a network that loses
+//! nothing and takes no time. That flow plans for itself, or as a gateway that speaks for a flow of
+//! its layer as well: then it tells that one of all the others.
 
 use std::time::{Duration, Instant};
 
@@ -51,7 +53,11 @@ impl Names {
     }
 }
 
-fn registry(name: &str, layer_scope: Option<LayerScopeId>, now: Instant) -> anyhow::Result<Registry> {
+fn registry(
+    name: &str,
+    layer_scope: Option<LayerScopeId>,
+    now: Instant,
+) -> anyhow::Result<Registry> {
     let me: FlowId = name.parse()?;
     let mut registry = Registry::new(RegistryConfig {
         kind: me.layer.as_str().parse()?,
@@ -70,7 +76,13 @@ fn registry(name: &str, layer_scope: Option<LayerScopeId>, now: Instant) -> anyh
     Ok(registry)
 }
 
-fn lease(registry: &mut Registry, now: Instant, op: &str, topic: &str, rate_hz: u32) -> anyhow::Result<()> {
+fn lease(
+    registry: &mut Registry,
+    now: Instant,
+    op: &str,
+    topic: &str,
+    rate_hz: u32,
+) -> anyhow::Result<()> {
     let mut message = json!({"op": op, "topic": topic, "service": "bench", "ttl_s": 0});
     if op == "advertise" {
         message["rate_hz"] = rate_hz.into();
@@ -162,13 +174,7 @@ impl Fleet {
                 }
             }
         }
-        let mut fleet = Self {
-            now,
-            hub,
-            nodes,
-            member,
-            told: 0,
-        };
+        let mut fleet = Self { now, hub, nodes, member, told: 0 };
         fleet.meet()?;
         Ok(fleet)
     }
@@ -187,7 +193,8 @@ impl Fleet {
                 self.hub.on_hello(self.now, &from, &said);
             }
             self.exchange();
-            let flows: Vec<FlowId> = self.nodes.iter().map(|node| node.world().me.clone()).collect();
+            let flows: Vec<FlowId> =
+                self.nodes.iter().map(|node| node.world().me.clone()).collect();
             if flows.iter().all(|flow| self.hub.is_in_step_with(flow)) {
                 return Ok(());
             }
@@ -199,11 +206,8 @@ impl Fleet {
         let hub = self.hub.world().me.clone();
         for (to, body) in self.hub.poll(self.now) {
             self.told += LinkControl::from(body.clone()).encoded_len() + HEADERS;
-            let node = to
-                .node
-                .as_str()
-                .strip_prefix("node-")
-                .and_then(|number| number.parse().ok());
+            let node =
+                to.node.as_str().strip_prefix("node-").and_then(|number| number.parse().ok());
             let Some(node) = node.and_then(|index: usize| self.nodes.get_mut(index)) else {
                 continue;
             };
@@ -219,7 +223,8 @@ impl Fleet {
         }
     }
 
-    /// A gateway gets to know the flow of its layer that it speaks for. Returns what that one says of itself.
+    /// A gateway gets to know the flow of its layer that it speaks for. Returns what that one says
+    /// of itself.
     fn meet_member(&mut self, member: &mut Registry) -> anyhow::Result<Hello> {
         let (hub, from) = (self.hub.world().me.clone(), member.world().me.clone());
         member.poll(self.now);
@@ -244,7 +249,8 @@ impl Fleet {
         anyhow::bail!("the gateway does not know its member after {ROUNDS} rounds")
     }
 
-    /// The median times of a full plan, and of telling all topics when a gateway begins to speak for the other flow of its layer.
+    /// The median times of a full plan, and of telling all topics when a gateway begins to speak
+    /// for the other flow of its layer.
     fn cost(&mut self, topics: &[TopicName], rules: &PlanRules) -> anyhow::Result<Cost> {
         let comes_back = match self.member.take() {
             Some(mut member) => {
@@ -274,11 +280,7 @@ impl Fleet {
             let told = before != self.hub.announced_on_layer();
             anyhow::ensure!(comes_back.is_none() || told, "nothing was told");
         }
-        Ok(Cost {
-            plan: median(plans),
-            tell: median(tells),
-            bridges,
-        })
+        Ok(Cost { plan: median(plans), tell: median(tells), bridges })
     }
 
     /// What is marked is told.
@@ -295,7 +297,8 @@ impl Fleet {
         self.hub.all_topics().into_iter().collect()
     }
 
-    /// The median time of a change at one node, from its announcement until the flow has planned what follows.
+    /// The median time of a change at one node, from its announcement until the flow has planned
+    /// what follows.
     fn change(&mut self, names: Names, rules: &PlanRules) -> anyhow::Result<Duration> {
         let hub = self.hub.world().me.clone();
         let mut times = Vec::new();
@@ -337,7 +340,15 @@ impl Fleet {
 pub(crate) fn run() -> anyhow::Result<()> {
     println!(
         "{:>6} {:<7} {:<7} {:>9} {:>9} {:>14} {:>12} {:>12} {:>16}",
-        "NODES", "NAMES", "GATEWAY", "TOPICS", "BRIDGES", "FULL PLAN/ms", "TELL ALL/ms", "CHANGE/us", "HELLO bytes/s"
+        "NODES",
+        "NAMES",
+        "GATEWAY",
+        "TOPICS",
+        "BRIDGES",
+        "FULL PLAN/ms",
+        "TELL ALL/ms",
+        "CHANGE/us",
+        "HELLO bytes/s"
     );
     for names in [Names::Shared, Names::Own] {
         for count in NODES {

@@ -6,7 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use blaze_brokers::{Broker, Content, Health, Publisher, PublisherOptions, SubscribeOptions, Subscription};
+use blaze_brokers::{
+    Broker, Content, Health, Publisher, PublisherOptions, SubscribeOptions, Subscription,
+};
 use blaze_domain::names::ChannelName;
 use blaze_tests::fleet::Written;
 use bytes::Bytes;
@@ -76,7 +78,8 @@ pub(crate) struct Row {
     pub(crate) put: Spread,
     /// The broker alone: a message of that size from one client to another, between the changes.
     pub(crate) plain: Spread,
-    /// CPU time of a change, in ms: of the main service; of all workers, all services and this program.
+    /// CPU time of a change, in ms: of the main service; of all workers, all services and this
+    /// program.
     pub(crate) main_cpu_ms: f64,
     pub(crate) own_cpu_ms: f64,
     /// Of one worker, without its service.
@@ -143,7 +146,13 @@ struct Times {
 }
 
 /// One change, heard by all that it concerns, and the pause after it.
-async fn change(fleet: &mut Fleet, plan: &Plan, whom: Whom, number: usize, times: &mut Times) -> anyhow::Result<()> {
+async fn change(
+    fleet: &mut Fleet,
+    plan: &Plan,
+    whom: Whom,
+    number: usize,
+    times: &mut Times,
+) -> anyhow::Result<()> {
     let at = number % plan.workers;
     let (path, spec) = match whom {
         Whom::One => (
@@ -174,9 +183,7 @@ async fn change(fleet: &mut Fleet, plan: &Plan, whom: Whom, number: usize, times
         let after = since(&written, heard.at);
         last = last.max(after);
         times.after_answer.push(after);
-        times
-            .after_request
-            .push(heard.at.saturating_duration_since(written.sent));
+        times.after_request.push(heard.at.saturating_duration_since(written.sent));
     }
     times.last.push(last);
     times.put.push(written.answered - written.sent);
@@ -206,9 +213,7 @@ impl Plain {
         };
         let mut status = broker.status();
         let is_up = status.wait_for(|status| status.health == Health::Up);
-        tokio::time::timeout(PATIENCE, is_up)
-            .await
-            .context("the broker does not answer")??;
+        tokio::time::timeout(PATIENCE, is_up).await.context("the broker does not answer")??;
         let subscription = broker.subscribe(&channel, SubscribeOptions::default()).await?;
         Ok(Self {
             publisher: broker.publisher(&channel, PublisherOptions::default())?,
@@ -227,7 +232,8 @@ impl Plain {
         self.publisher.publish_bare(&payload, None);
         loop {
             let mut batch = Vec::new();
-            let received = tokio::time::timeout(PATIENCE, self.subscription.receive(&mut batch, 1)).await;
+            let received =
+                tokio::time::timeout(PATIENCE, self.subscription.receive(&mut batch, 1)).await;
             anyhow::ensure!(
                 received.context("the broker delivers nothing")? > 0,
                 "the broker was closed"

@@ -22,12 +22,7 @@ impl Spread {
             let index = ((times.len() as f64 * part) as usize).min(times.len().saturating_sub(1));
             times.get(index).map_or(0.0, |time| time.as_secs_f64() * 1e3)
         };
-        Self {
-            count: times.len(),
-            p50_ms: at(0.5),
-            p99_ms: at(0.99),
-            max_ms: at(1.0),
-        }
+        Self { count: times.len(), p50_ms: at(0.5), p99_ms: at(0.99), max_ms: at(1.0) }
     }
 }
 
@@ -39,18 +34,12 @@ pub(crate) struct Clock {
 
 impl Clock {
     pub(crate) fn start(process: u32) -> anyhow::Result<Self> {
-        Ok(Self {
-            process,
-            begun: cpu_time(process)?,
-        })
+        Ok(Self { process, begun: cpu_time(process)? })
     }
 
     /// From the beginning of the process on.
     pub(crate) fn since_start(process: u32) -> Self {
-        Self {
-            process,
-            begun: Duration::ZERO,
-        }
+        Self { process, begun: Duration::ZERO }
     }
 
     pub(crate) fn used(&self) -> anyhow::Result<Duration> {

@@ -54,7 +54,9 @@ enum BrokerServer {
 impl BrokerServer {
     fn start(kind: BrokerKind) -> anyhow::Result<Self> {
         Ok(match kind {
-            BrokerKind::Redis => Self::Redis(RedisServer::start(RedisKind::Redis, RedisOptions::default())?),
+            BrokerKind::Redis => {
+                Self::Redis(RedisServer::start(RedisKind::Redis, RedisOptions::default())?)
+            }
             BrokerKind::Kafka => Self::Kafka(KafkaServer::start(KafkaOptions::default())?),
         })
     }
@@ -67,7 +69,8 @@ impl BrokerServer {
     }
 }
 
-/// All of it. Fields are dropped in this order: services before their workers, workers before what they are connected to.
+/// All of it. Fields are dropped in this order: services before their workers, workers before what
+/// they are connected to.
 pub(crate) struct Fleet {
     pub(crate) listeners: Vec<Listener>,
     pub(crate) workers: Vec<Worker>,
@@ -85,8 +88,8 @@ pub(crate) fn node(number: usize) -> String {
 }
 
 impl Fleet {
-    /// A main service with a layer of so many nodes and some services, without a worker yet. Without a broker, each worker has
-    /// one in memory.
+    /// A main service with a layer of so many nodes and some services, without a worker yet.
+    /// Without a broker, each worker has one in memory.
     pub(crate) async fn new(
         parent: &Path,
         broker: Option<BrokerKind>,
@@ -100,11 +103,15 @@ impl Fleet {
             json!({ "kind": "Layer", "name": LAYER, "spec": { "kind": "edge" } }),
             json!({ "kind": "Service", "name": SERVICE, "spec": { "config": config(0) } }),
         ];
-        documents.extend(
-            (0..nodes).map(|number| json!({ "kind": "Node", "name": node(number), "spec": { "layer": LAYER } })),
-        );
+        documents.extend((0..nodes).map(
+            |number| json!({ "kind": "Node", "name": node(number), "spec": { "layer": LAYER } }),
+        ));
         documents.extend((0..services).map(|number| {
-            json!({ "kind": "Service", "name": format!("other-{number}"), "spec": { "config": config(number) } })
+            json!({
+                "kind": "Service",
+                "name": format!("other-{number}"),
+                "spec": { "config": config(number) },
+            })
         }));
         api.apply(&documents).await?;
         Ok(Self {
@@ -112,19 +119,19 @@ impl Fleet {
             workers: Vec::new(),
             main,
             api,
-            server: broker
-                .map(|kind| block_in_place(|| BrokerServer::start(kind)))
-                .transpose()?,
+            server: broker.map(|kind| block_in_place(|| BrokerServer::start(kind))).transpose()?,
             before: usage(std::process::id()).context("this process runs")?,
             folder,
         })
     }
 
-    /// Starts workers, one on each of the first nodes, and waits until all have what the main service has.
+    /// Starts workers, one on each of the first nodes, and waits until all have what the main
+    /// service has.
     pub(crate) async fn start_workers(&mut self, count: usize) -> anyhow::Result<()> {
         for number in self.workers.len()..count {
             let node = node(number);
-            let spec = WorkerSpec::on_memory(LAYER, &node, &self.main.server()).kept_in(self.folder.path().join(&node));
+            let spec = WorkerSpec::on_memory(LAYER, &node, &self.main.server())
+                .kept_in(self.folder.path().join(&node));
             let spec = self.server.iter().fold(spec, |spec, server| server.of(spec));
             self.workers.push(Worker::start(&spec).await?);
         }
@@ -134,10 +141,7 @@ impl Fleet {
 
     /// Starts the service that is changed beside each worker.
     pub(crate) async fn start_listeners(&mut self) -> anyhow::Result<()> {
-        let starts = self
-            .workers
-            .iter()
-            .map(|worker| Listener::start(worker, SERVICE, "0", START));
+        let starts = self.workers.iter().map(|worker| Listener::start(worker, SERVICE, "0", START));
         self.listeners = try_join_all(starts).await?;
         Ok(())
     }
@@ -145,7 +149,9 @@ impl Fleet {
     /// What this process has taken since there was no worker, for each of them.
     pub(crate) fn taken_per_worker(&self) -> anyhow::Result<Taken> {
         let now = usage(std::process::id()).context("this process runs")?;
-        let each = |now: u64, before: u64| now.saturating_sub(before) as f64 / self.workers.len().max(1) as f64;
+        let each = |now: u64, before: u64| {
+            now.saturating_sub(before) as f64 / self.workers.len().max(1) as f64
+        };
         Ok(Taken {
             resident_kib: each(now.resident_kib, self.before.resident_kib),
             threads: each(now.threads, self.before.threads),
@@ -171,7 +177,18 @@ pub(crate) struct Taken {
 pub(crate) fn config(number: usize) -> Value {
     json!({
         "camera": { "rate_hz": 30, "exposure_us": 8000 + number, "gain": 1.5, "format": "mono8" },
-        "map": { "resolution_m": 0.05, "size_m": [100, 100], "frame": "world", "publish_period_ms": 500 },
-        "matcher": { "kind": "loop-closing", "window": 20, "threshold": 0.82, "threads": 2, "descriptors": "orb" },
+        "map": {
+            "resolution_m": 0.05,
+            "size_m": [100, 100],
+            "frame": "world",
+            "publish_period_ms": 500,
+        },
+        "matcher": {
+            "kind": "loop-closing",
+            "window": 20,
+            "threshold": 0.82,
+            "threads": 2,
+            "descriptors": "orb",
+        },
     })
 }

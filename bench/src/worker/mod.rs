@@ -1,5 +1,5 @@
-//! What a fleet of workers does with changes: how long a change takes to a service, what it costs, and how a fleet comes back
-//! after the main service was away.
+//! What a fleet of workers does with changes: how long a change takes to a service, what it costs,
+//! and how a fleet comes back after the main service was away.
 //!
 //! ```text
 //!          ┌─REST─▶ blaze-config ─gRPC─▶ worker 1 … worker n (this process) ─▶ Redis or Kafka ─▶ service 1 … service n
@@ -7,9 +7,9 @@
 //!          └────────────────────────────── the clock ─────────────────────────────────────────────────────┘
 //! ```
 //!
-//! Nothing counts that was not right: each change must be heard by each service that it concerns, and by no other. Needs
-//! `scripts/services install`, and is meant for release builds:
-//! `cargo build --release --workspace --bins && target/release/blaze-bench worker`.
+//! Nothing counts that was not right: each change must be heard by each service that it concerns,
+//! and by no other. Needs `scripts/services install`, and is meant for release builds: `cargo build
+//! --release --workspace --bins && target/release/blaze-bench worker`.
 
 mod delivery;
 mod figures;
@@ -44,8 +44,8 @@ pub(crate) struct Arguments {
     /// Changes that are measured, of each kind
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     changes: u32,
-    /// Shortest pause between a change that was heard and the next one, in ms; the longest is twice that. Changes within 20 ms
-    /// become one notice
+    /// Shortest pause between a change that was heard and the next one, in ms; the longest is twice
+    /// that. Changes within 20 ms become one notice
     #[arg(long, default_value_t = 30)]
     pause_ms: u64,
     /// Services besides the one that is changed, without instances
@@ -57,7 +57,8 @@ pub(crate) struct Arguments {
     /// Workers whose main service is restarted
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=2_000))]
     restarted: u32,
-    /// How long it stays away each time, in ms: workers try at longer intervals the longer it does, up to 2 s
+    /// How long it stays away each time, in ms: workers try at longer intervals the longer it does,
+    /// up to 2 s
     #[arg(long, value_delimiter = ',', default_value = "0,0,5000,5000")]
     away_ms: Vec<u64>,
     /// Folder for the data of all servers; else the one that holds this program, under target/
@@ -109,9 +110,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         for part in &arguments.only {
             match part {
                 Part::Delivery => deliver(arguments, folder.path(), &mut report).await?,
-                Part::Touched => report.add_touched(touched::run(folder.path(), arguments.touched as usize).await?),
+                Part::Touched => report
+                    .add_touched(touched::run(folder.path(), arguments.touched as usize).await?),
                 Part::Restart => {
-                    let away: Vec<_> = arguments.away_ms.iter().copied().map(Duration::from_millis).collect();
+                    let away: Vec<_> =
+                        arguments.away_ms.iter().copied().map(Duration::from_millis).collect();
                     let (workers, services) = (arguments.restarted as usize, arguments.services);
                     restart::run(folder.path(), workers, services, &away, &mut report).await?;
                 }
@@ -122,14 +125,14 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     if let Some(path) = &arguments.json {
         report.write(path)?;
     }
-    Ok(if report.misses_a_bar() {
-        ExitCode::FAILURE
-    } else {
-        ExitCode::SUCCESS
-    })
+    Ok(if report.misses_a_bar() { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }
 
-async fn deliver(arguments: &Arguments, folder: &std::path::Path, report: &mut Report) -> anyhow::Result<()> {
+async fn deliver(
+    arguments: &Arguments,
+    folder: &std::path::Path,
+    report: &mut Report,
+) -> anyhow::Result<()> {
     for broker in &arguments.broker {
         for workers in arguments.workers_on(*broker) {
             let plan = delivery::Plan {
@@ -140,7 +143,9 @@ async fn deliver(arguments: &Arguments, folder: &std::path::Path, report: &mut R
                 services: arguments.services,
             };
             let rows = delivery::run(folder, &plan).await;
-            report.add_delivery(rows.with_context(|| format!("{workers} workers on {}", broker.name()))?);
+            report.add_delivery(
+                rows.with_context(|| format!("{workers} workers on {}", broker.name()))?,
+            );
         }
     }
     Ok(())

@@ -22,12 +22,7 @@ pub(crate) struct Report {
 
 impl Report {
     pub(crate) fn new(machine: Machine) -> Self {
-        Self {
-            machine,
-            delivery: Vec::new(),
-            touched: Vec::new(),
-            restarts: Vec::new(),
-        }
+        Self { machine, delivery: Vec::new(), touched: Vec::new(), restarts: Vec::new() }
     }
 
     pub(crate) fn print_machine(&self) {
@@ -74,7 +69,8 @@ impl Report {
         if let Some(row) = rows.first() {
             let (alone, both) = (&row.worker, &row.with_service);
             println!(
-                "        one worker of {} takes {:.2} MiB, {:.1} threads, {:.1} descriptors; with its service {:.2} MiB, {:.1}, {:.1}",
+                "        one worker of {} takes {:.2} MiB, {:.1} threads, {:.1} descriptors; with \
+                 its service {:.2} MiB, {:.1}, {:.1}",
                 row.workers,
                 alone.resident_kib / 1024.0,
                 alone.threads,
@@ -91,7 +87,13 @@ impl Report {
         println!("\nWhat a change of a layer costs one worker, in ms");
         println!(
             "{:<20} {:>8} {:>8} {:>18} {:>11} {:>11} {:>11}",
-            "TOUCHES", "SERVICES", "NOTICES", "LAST p50, p99", "WORKER cpu", "MAIN cpu", "WORKER MiB"
+            "TOUCHES",
+            "SERVICES",
+            "NOTICES",
+            "LAST p50, p99",
+            "WORKER cpu",
+            "MAIN cpu",
+            "WORKER MiB"
         );
         for row in &rows {
             println!(
@@ -113,7 +115,12 @@ impl Report {
             println!("\nThe main service is killed and started under its workers, in ms");
             println!(
                 "{:>7} {:>8} {:>24} {:>8} {:>24} {:>9}  BACK IN EACH 250 ms",
-                "WORKERS", "AWAY", "IN SYNC p50, p99, max", "REFUSED", "GET p50, p99, max", "MAIN cpu"
+                "WORKERS",
+                "AWAY",
+                "IN SYNC p50, p99, max",
+                "REFUSED",
+                "GET p50, p99, max",
+                "MAIN cpu"
             );
         }
         let quarters: Vec<String> = row.by_quarter.iter().map(ToString::to_string).collect();

@@ -54,15 +54,10 @@ pub(crate) async fn run(parent: &Path, services: usize) -> anyhow::Result<Vec<Ro
     let worker = block_in_place(|| WorkerProcess::start(folder.path(), &spec))?;
     let notices = listen(&redis.url(), &format!("{}:blaze/config/changed/*", node(0)))?;
     let mut rows = Vec::new();
-    for (change, touched) in [
-        ("nothing that counts", 0),
-        ("one service", 1),
-        ("all services", services),
-    ] {
-        let clocks = (
-            Clock::start(worker.process().id())?,
-            Clock::start(fleet.main_process()?)?,
-        );
+    for (change, touched) in
+        [("nothing that counts", 0), ("one service", 1), ("all services", services)]
+    {
+        let clocks = (Clock::start(worker.process().id())?, Clock::start(fleet.main_process()?)?);
         let mut last = Vec::with_capacity(CHANGES);
         for number in 0..CHANGES {
             let spec = match touched {
@@ -73,7 +68,8 @@ pub(crate) async fn run(parent: &Path, services: usize) -> anyhow::Result<Vec<Ro
             let written = fleet.api.replace_timed("/layers/edge", spec).await?;
             let mut latest = written.answered;
             for _ in 0..touched {
-                let notice = block_in_place(|| notices.recv_timeout(PATIENCE)).context("a notice in time")?;
+                let notice = block_in_place(|| notices.recv_timeout(PATIENCE))
+                    .context("a notice in time")?;
                 anyhow::ensure!(
                     notice.revision == written.revision,
                     "a notice of revision {}, though {} was changed",

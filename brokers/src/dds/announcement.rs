@@ -1,4 +1,5 @@
-//! What is read of participants' announcements (SPDP). They come from the network, so every length is checked.
+//! What is read of participants' announcements (SPDP). They come from the network, so every length
+//! is checked.
 
 use super::GuidPrefix;
 
@@ -35,7 +36,10 @@ impl Announcement {
                 length => length,
             };
             let (body, next) = body.split_at_checked(length)?;
-            if head[0] == SUBMESSAGE_DATA && head[1] & FLAG_DATA != 0 && body.get(8..12) == Some(&SPDP_WRITER) {
+            if head[0] == SUBMESSAGE_DATA
+                && head[1] & FLAG_DATA != 0
+                && body.get(8..12) == Some(&SPDP_WRITER)
+            {
                 return Some(Self {
                     prefix,
                     multicast: announces_multicast(head[1], body, little).unwrap_or(false),
@@ -63,7 +67,11 @@ fn announces_multicast(flags: u8, body: &[u8], little: bool) -> Option<bool> {
     Some(found)
 }
 
-fn after_parameters(mut list: &[u8], little: bool, mut visit: impl FnMut(u16, &[u8])) -> Option<&[u8]> {
+fn after_parameters(
+    mut list: &[u8],
+    little: bool,
+    mut visit: impl FnMut(u16, &[u8]),
+) -> Option<&[u8]> {
     loop {
         let (head, rest) = list.split_at_checked(4)?;
         let (id, length) = (read_u16(head, little)?, usize::from(read_u16(&head[2..], little)?));
@@ -78,11 +86,7 @@ fn after_parameters(mut list: &[u8], little: bool, mut visit: impl FnMut(u16, &[
 
 fn read_u16(bytes: &[u8], little: bool) -> Option<u16> {
     let bytes = *bytes.first_chunk::<2>()?;
-    Some(if little {
-        u16::from_le_bytes(bytes)
-    } else {
-        u16::from_be_bytes(bytes)
-    })
+    Some(if little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) })
 }
 
 #[cfg(test)]
@@ -113,11 +117,9 @@ mod tests {
         let prefix = GuidPrefix(*b"abcdefghijkl");
         let mut locator = [0; 24];
         locator[20..].copy_from_slice(&[239, 255, 0, 1]);
-        for (id, multicast) in [
-            (PID_METATRAFFIC_MULTICAST, true),
-            (PID_DEFAULT_MULTICAST, true),
-            (0x0031, false),
-        ] {
+        for (id, multicast) in
+            [(PID_METATRAFFIC_MULTICAST, true), (PID_DEFAULT_MULTICAST, true), (0x0031, false)]
+        {
             let message = announcement(id, &locator);
             assert_eq!(Announcement::parse(&message), Some(Announcement { prefix, multicast }));
         }

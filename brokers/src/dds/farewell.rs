@@ -1,8 +1,9 @@
 //! Good-bye in the name of a participant that cannot say it any more.
 //!
-//! A participant that ends tells so, and RustDDS then forgets its readers at once, else only after the lease that it
-//! announced: 50 s for RustDDS, during which reliable writers wait for its acknowledgements. The datagram here is what
-//! RustDDS itself sends when it ends; it goes to the own participant alone, and others are not told.
+//! A participant that ends tells so, and RustDDS then forgets its readers at once, else only after
+//! the lease that it announced: 50 s for RustDDS, during which reliable writers wait for its
+//! acknowledgements. The datagram here is what RustDDS itself sends when it ends; it goes to the
+//! own participant alone, and others are not told.
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
@@ -89,10 +90,7 @@ mod tests {
         let message = datagram(GuidPrefix(*b"abcdefghijkl"), 7);
         assert_eq!(&message[..8], b"RTPS\x02\x04\x01\x12");
         assert_eq!(&message[8..20], b"abcdefghijkl");
-        assert_eq!(
-            usize::from(u16::from_le_bytes([message[22], message[23]])),
-            message.len() - 24
-        );
+        assert_eq!(usize::from(u16::from_le_bytes([message[22], message[23]])), message.len() - 24);
         let place = message.windows(12).rposition(|part| part == b"abcdefghijkl").unwrap();
         assert_eq!(&message[place - 4..place], &PARTICIPANT_GUID);
         assert_eq!(&message[place + 12..place + 16], &PARTICIPANT);

@@ -1,4 +1,5 @@
-//! Faults inside RustDDS on demand. Its event loop calls the wakers of readers, so a waker can end or block it.
+//! Faults inside RustDDS on demand. Its event loop calls the wakers of readers, so a waker can end
+//! or block it.
 
 use std::sync::Arc;
 use std::task::{Wake, Waker};
@@ -42,7 +43,8 @@ pub(super) fn inject(participant: &Participant, fault: Fault) -> Result<(), DdsE
         }
         thread::sleep(Duration::from_millis(10));
     }
-    // Both stay until the event loop has met the waker; a dead or hanging loop never hears of their end anyway.
+    // Both stay until the event loop has met the waker; a dead or hanging loop never hears of their
+    // end anyway.
     thread::sleep(Duration::from_millis(50));
     Ok(())
 }

@@ -1,5 +1,5 @@
-//! A packet filter in the kernel (classic BPF) that keeps datagrams from RustDDS 0.15 which make it allocate without
-//! bound, stand still or panic, and which it never sends itself:
+//! A packet filter in the kernel (classic BPF) that keeps datagrams from RustDDS 0.15 which make it
+//! allocate without bound, stand still or panic, and which it never sends itself:
 //!
 //! | submessage | dropped when |
 //! |---|---|
@@ -7,10 +7,11 @@
 //! | HEARTBEAT, GAP | a sequence number is not within 0 to 2³¹ − 1, or the range is wider than any that RustDDS sends |
 //! | ACKNACK, NACK_FRAG, HEARTBEAT_FRAG | a sequence number is negative or above 2³² − 1, the bitmap or fragment number is beyond all that RustDDS sends for the samples of its topics |
 //!
-//! Everything else passes; what RustDDS' parser refuses is left to it. The walk over the submessages is unrolled, since a
-//! filter has no loops, so datagrams with more submessages than there are steps are dropped, too. A *full* step knows
-//! all kinds. A *quick* step takes DATA and INFO_TS as RustDDS writes them, of which it packs many into one datagram;
-//! at anything else it leaves to the next full step.
+//! Everything else passes; what RustDDS' parser refuses is left to it. The walk over the
+//! submessages is unrolled, since a filter has no loops, so datagrams with more submessages than
+//! there are steps are dropped, too. A *full* step knows all kinds. A *quick* step takes DATA and
+//! INFO_TS as RustDDS writes them, of which it packs many into one datagram; at anything else it
+//! leaves to the next full step.
 
 mod assembler;
 mod program;

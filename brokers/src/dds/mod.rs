@@ -1,5 +1,5 @@
-//! RustDDS behind a small surface: one participant on one interface, samples that are plain octets, discovery over
-//! unicast, and the means to see that a participant has died.
+//! RustDDS behind a small surface: one participant on one interface, samples that are plain octets,
+//! discovery over unicast, and the means to see that a participant has died.
 //!
 //! ```text
 //! Participant ── Writer::write ──► RustDDS event loop ──► UDP
@@ -8,8 +8,8 @@
 //! Relay       ── repeats the participant's announcement to hosts that multicast does not reach
 //! ```
 //!
-//! Nothing here blocks a caller on the network, and a panic inside RustDDS never leaves this module: it marks the
-//! participant as failed, and the owner builds a new one.
+//! Nothing here blocks a caller on the network, and a panic inside RustDDS never leaves this
+//! module: it marks the participant as failed, and the owner builds a new one.
 
 mod announcement;
 mod farewell;
@@ -61,7 +61,8 @@ fn announcement_port(domain: u16, slot: u16) -> u16 {
 /// Why DDS refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DdsError {
-    /// Ports of that domain would lie in the range that systems give out by themselves, or above all.
+    /// Ports of that domain would lie in the range that systems give out by themselves, or above
+    /// all.
     #[error("DDS domain {0} is above {MAX_DDS_DOMAIN}")]
     Domain(u16),
     /// RustDDS speaks IPv4 alone.
@@ -88,21 +89,27 @@ pub enum DdsError {
     Panicked(&'static str),
 }
 
-/// Whether participants of a domain can be on the interface with an address, as far as that shows without the system.
+/// Whether participants of a domain can be on the interface with an address, as far as that shows
+/// without the system.
 ///
 /// # Errors
 /// [`DdsError::Domain`] and [`DdsError::Address`].
 pub fn check(domain: u16, address: IpAddr) -> Result<Ipv4Addr, DdsError> {
     match address {
         _ if domain > MAX_DDS_DOMAIN => Err(DdsError::Domain(domain)),
-        IpAddr::V4(one) if !(one.is_unspecified() || one.is_multicast() || one.is_broadcast()) => Ok(one),
+        IpAddr::V4(one) if !(one.is_unspecified() || one.is_multicast() || one.is_broadcast()) => {
+            Ok(one)
+        }
         _ => Err(DdsError::Address(address)),
     }
 }
 
-/// Drops what is left of a participant. Its end may hang, so it is left to a thread of its own, which calls `over` and tells
-/// the receiver when it is over.
-pub fn lay_aside(remains: impl Send + 'static, over: impl FnOnce() + Send + 'static) -> Option<Receiver<()>> {
+/// Drops what is left of a participant. Its end may hang, so it is left to a thread of its own,
+/// which calls `over` and tells the receiver when it is over.
+pub fn lay_aside(
+    remains: impl Send + 'static,
+    over: impl FnOnce() + Send + 'static,
+) -> Option<Receiver<()>> {
     let (done, receiver) = sync_channel(1);
     let thread = thread::Builder::new().name("dds-remains".into()).spawn(move || {
         let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
@@ -119,8 +126,5 @@ pub fn lay_aside(remains: impl Send + 'static, over: impl FnOnce() + Send + 'sta
 }
 
 fn create_error(what: &'static str) -> impl FnOnce(std::io::Error) -> DdsError {
-    move |error| DdsError::Create {
-        what,
-        error: error.to_string(),
-    }
+    move |error| DdsError::Create { what, error: error.to_string() }
 }

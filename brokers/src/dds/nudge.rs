@@ -1,8 +1,8 @@
 //! Keeps RustDDS reading announcements.
 //!
-//! RustDDS reads what participants announce up to the first announcement that it cannot decode, and goes on when the next
-//! datagram comes. So a few dozen forged ones would keep newcomers out for minutes, until as many good ones have come. A
-//! datagram that tells nothing lets it go on.
+//! RustDDS reads what participants announce up to the first announcement that it cannot decode, and
+//! goes on when the next datagram comes. So a few dozen forged ones would keep newcomers out for
+//! minutes, until as many good ones have come. A datagram that tells nothing lets it go on.
 
 use std::io;
 use std::net::{SocketAddrV4, UdpSocket};

@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
-    DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder, RTPSEntity,
-    Subscriber, Topic, TopicKind, no_key,
+    DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies,
+    QosPolicyBuilder, RTPSEntity, Subscriber, Topic, TopicKind, no_key,
 };
 
 use super::filter::{self, Attached, FilterError, Samples, Shape};
@@ -44,17 +44,21 @@ pub struct ParticipantConfig {
     pub domain: u16,
     /// Address of the one interface that it announces. Never unspecified.
     pub address: Ipv4Addr,
-    /// Send buffer of the socket in bytes: what can queue in the system behind the application's pacing.
+    /// Send buffer of the socket in bytes: what can queue in the system behind the application's
+    /// pacing.
     pub send_buffer_bytes: usize,
-    /// Bytes of the largest sample that comes in fragments. RustDDS takes memory for a whole sample when the first
-    /// fragment comes, from any sender, so larger ones (than the next power of two) are dropped before it sees them.
+    /// Bytes of the largest sample that comes in fragments. RustDDS takes memory for a whole sample
+    /// when the first fragment comes, from any sender, so larger ones (than the next power of two)
+    /// are dropped before it sees them.
     pub largest_sample: u32,
-    /// Whether single fragments of such samples are asked for again, as readers of reliable writers do.
+    /// Whether single fragments of such samples are asked for again, as readers of reliable writers
+    /// do.
     pub repairs_fragments: bool,
 }
 
 impl ParticipantConfig {
-    /// A participant with RustDDS' receive buffer, a send buffer of 64 KiB and fragmented samples up to 64 KiB.
+    /// A participant with RustDDS' receive buffer, a send buffer of 64 KiB and fragmented samples
+    /// up to 64 KiB.
     #[must_use]
     pub fn new(domain: u16, address: Ipv4Addr) -> Self {
         Self {
@@ -67,10 +71,7 @@ impl ParticipantConfig {
     }
 
     fn samples(&self) -> Samples {
-        Samples {
-            largest: self.largest_sample,
-            repaired: self.repairs_fragments,
-        }
+        Samples { largest: self.largest_sample, repaired: self.repairs_fragments }
     }
 
     fn check(&self) -> Result<(), DdsError> {
@@ -79,10 +80,7 @@ impl ParticipantConfig {
         // RustDDS would announce no address at all and stay invisible.
         match UdpSocket::bind((self.address, 0)) {
             Ok(_) => Ok(()),
-            Err(error) => Err(DdsError::AddressMissing {
-                address,
-                error: error.to_string(),
-            }),
+            Err(error) => Err(DdsError::AddressMissing { address, error: error.to_string() }),
         }
     }
 }
@@ -92,13 +90,14 @@ impl ParticipantConfig {
 pub struct Profile {
     /// RTPS repairs losses. A write to a full window is refused, it never waits.
     pub reliable: bool,
-    /// Writers: samples that may wait for the event loop, and with `transient_local` those kept for late joiners.
-    /// Readers: samples that may wait for the sink.
+    /// Writers: samples that may wait for the event loop, and with `transient_local` those kept for
+    /// late joiners. Readers: samples that may wait for the sink.
     pub depth: u16,
     /// Late joiners get the last `depth` samples.
     pub transient_local: bool,
-    /// Reliable writers: samples that may be under way at once, acknowledged by some readers and not by others; at least
-    /// `depth`. RustDDS keeps them, and those of the last six seconds, in memory.
+    /// Reliable writers: samples that may be under way at once, acknowledged by some readers and
+    /// not by others; at least `depth`. RustDDS keeps them, and those of the last six seconds, in
+    /// memory.
     pub window: u16,
 }
 
@@ -106,22 +105,14 @@ impl Profile {
     /// Best effort with room for `depth` samples.
     #[must_use]
     pub fn best_effort(depth: u16) -> Self {
-        Self {
-            reliable: false,
-            depth,
-            transient_local: false,
-            window: 0,
-        }
+        Self { reliable: false, depth, transient_local: false, window: 0 }
     }
 
     fn qos(self) -> QosPolicies {
         let depth = i32::from(self.depth.max(1));
         let samples = depth.max(i32::from(self.window));
-        let durability = if self.transient_local {
-            Durability::TransientLocal
-        } else {
-            Durability::Volatile
-        };
+        let durability =
+            if self.transient_local { Durability::TransientLocal } else { Durability::Volatile };
         let builder = QosPolicyBuilder::new()
             .durability(durability)
             .history(History::KeepLast { depth })
@@ -138,8 +129,8 @@ impl Profile {
     }
 }
 
-/// One participant. Dropping it says good-bye to the others and ends its threads, which may take a while when one of
-/// them hangs: drop it where that does not matter.
+/// One participant. Dropping it says good-bye to the others and ends its threads, which may take a
+/// while when one of them hangs: drop it where that does not matter.
 pub struct Participant {
     dds: DomainParticipant,
     publisher: Publisher,
@@ -153,17 +144,13 @@ pub struct Participant {
 
 impl fmt::Debug for Participant {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "Participant {} on {} port {}",
-            self.prefix, self.config.address, self.port
-        )
+        write!(f, "Participant {} on {} port {}", self.prefix, self.config.address, self.port)
     }
 }
 
 impl Participant {
-    /// Starts a participant. It announces itself to the other participants of this host; a [`super::Relay`] does so to
-    /// other hosts.
+    /// Starts a participant. It announces itself to the other participants of this host; a
+    /// [`super::Relay`] does so to other hosts.
     ///
     /// # Errors
     /// [`DdsError`] when the configuration is not possible here or now, or RustDDS cannot start.
@@ -226,7 +213,8 @@ impl Participant {
         weakness(&self.filter)
     }
 
-    /// Datagrams that the kernel dropped at its sockets: hostile ones, and those for which no room was left.
+    /// Datagrams that the kernel dropped at its sockets: hostile ones, and those for which no room
+    /// was left.
     #[must_use]
     pub fn dropped_by_kernel(&self) -> u64 {
         self.filter.as_ref().map_or(0, Attached::dropped)
@@ -249,12 +237,17 @@ impl Participant {
     ///
     /// # Errors
     /// [`DdsError`] when RustDDS refuses or has died.
-    pub fn reader(&self, topic: &str, profile: Profile, sink: SampleSink) -> Result<Reader, DdsError> {
+    pub fn reader(
+        &self,
+        topic: &str,
+        profile: Profile,
+        sink: SampleSink,
+    ) -> Result<Reader, DdsError> {
         Reader::start(self.raw_reader(topic, profile)?, sink, Arc::clone(&self.failed))
     }
 
-    /// Calls `sink` with the readers and writers of other participants whose topics begin with `topics`, whenever one comes
-    /// or goes, and once a second.
+    /// Calls `sink` with the readers and writers of other participants whose topics begin with
+    /// `topics`, whenever one comes or goes, and once a second.
     ///
     /// # Errors
     /// [`DdsError`] when there is no thread for it.
@@ -266,18 +259,20 @@ impl Participant {
         EndpointWatch::start(self.dds.clone(), self.prefix, topics, sink, Arc::clone(&self.failed))
     }
 
-    /// Whether its threads are alive, as far as that shows without traffic: a panic anywhere was seen, the event loop
-    /// holds its port, the discovery thread takes commands.
+    /// Whether its threads are alive, as far as that shows without traffic: a panic anywhere was
+    /// seen, the event loop holds its port, the discovery thread takes commands.
     #[must_use]
     pub fn is_alive(&self) -> bool {
         if self.failed.load(Ordering::Relaxed) {
             return false;
         }
-        let commands = catch_unwind(AssertUnwindSafe(|| self.dds.assert_liveliness().is_ok())).unwrap_or(false);
+        let commands = catch_unwind(AssertUnwindSafe(|| self.dds.assert_liveliness().is_ok()))
+            .unwrap_or(false);
         !port_is_free(self.port) && commands
     }
 
-    /// Ends or blocks the event loop of RustDDS, which then panics or hangs, for tests of those who must notice.
+    /// Ends or blocks the event loop of RustDDS, which then panics or hangs, for tests of those who
+    /// must notice.
     ///
     /// # Errors
     /// [`DdsError`] when RustDDS refuses or has died.
@@ -293,14 +288,20 @@ impl Participant {
     ) -> Result<no_key::SimpleDataReader<Octets, OctetsAdapter>, DdsError> {
         self.contain("reader", || {
             let topic = self.topic(name, profile)?;
-            self.subscriber
-                .create_simple_datareader_no_key::<Octets, OctetsAdapter>(&topic, Some(profile.qos()))
+            self.subscriber.create_simple_datareader_no_key::<Octets, OctetsAdapter>(
+                &topic,
+                Some(profile.qos()),
+            )
         })
     }
 
     fn topic(&self, name: &str, profile: Profile) -> rustdds::dds::CreateResult<Topic> {
-        self.dds
-            .create_topic(name.to_owned(), FRAME_TYPE.to_owned(), &profile.qos(), TopicKind::NoKey)
+        self.dds.create_topic(
+            name.to_owned(),
+            FRAME_TYPE.to_owned(),
+            &profile.qos(),
+            TopicKind::NoKey,
+        )
     }
 
     fn contain<T>(
@@ -319,10 +320,12 @@ impl Participant {
 fn weakness(filter: &Result<Attached, FilterError>) -> Option<String> {
     match filter {
         Ok(attached) if attached.shape == Shape::LARGE => None,
-        Ok(_) => Some("the packet filter is a small one, since net.core.optmem_max is below 61440".into()),
-        Err(error) => Some(format!(
-            "no packet filter, so any sender can exhaust the memory: {error}"
-        )),
+        Ok(_) => Some(
+            "the packet filter is a small one, since net.core.optmem_max is below 61440".into(),
+        ),
+        Err(error) => {
+            Some(format!("no packet filter, so any sender can exhaust the memory: {error}"))
+        }
     }
 }
 
@@ -335,13 +338,13 @@ fn warn_once(filter: &Result<Attached, FilterError>) {
     }
 }
 
-fn contain<T>(what: &'static str, make: impl FnOnce() -> rustdds::dds::CreateResult<T>) -> Result<T, DdsError> {
+fn contain<T>(
+    what: &'static str,
+    make: impl FnOnce() -> rustdds::dds::CreateResult<T>,
+) -> Result<T, DdsError> {
     match catch_unwind(AssertUnwindSafe(make)) {
         Ok(Ok(made)) => Ok(made),
-        Ok(Err(error)) => Err(DdsError::Create {
-            what,
-            error: error.to_string(),
-        }),
+        Ok(Err(error)) => Err(DdsError::Create { what, error: error.to_string() }),
         Err(_) => Err(DdsError::Panicked(what)),
     }
 }

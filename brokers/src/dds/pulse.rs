@@ -17,10 +17,11 @@ use super::{DdsError, Participant, Profile, Writer, create_error};
 const BEAT: Duration = Duration::from_millis(400);
 /// An event loop that did not answer for this long hangs.
 const HANG: Duration = Duration::from_millis(1500);
-/// After such a pause between two looks silence says nothing: this whole process may have stood still.
+/// After such a pause between two looks silence says nothing: this whole process may have stood
+/// still.
 const STALL: Duration = Duration::from_millis(800);
-/// RustDDS orders best-effort samples by the time of day, and delivers none until a clock that was set back has caught
-/// up; less than this is waited for.
+/// RustDDS orders best-effort samples by the time of day, and delivers none until a clock that was
+/// set back has caught up; less than this is waited for.
 const CLOCK_STEP: Duration = Duration::from_millis(500);
 
 /// Why a participant must be replaced.
@@ -37,8 +38,9 @@ pub enum Illness {
     ClockSetBack,
 }
 
-/// Feels whether a participant lives: it writes to a reader of the same participant, whose waker the event loop then
-/// calls. Nothing of this depends on the network. Each look also lets it read announcements on.
+/// Feels whether a participant lives: it writes to a reader of the same participant, whose waker
+/// the event loop then calls. Nothing of this depends on the network. Each look also lets it read
+/// announcements on.
 pub struct Pulse {
     writer: Writer,
     reader: SimpleDataReader<Octets, OctetsAdapter>,
@@ -81,8 +83,8 @@ impl Pulse {
         })
     }
 
-    /// Looks at the participant; call it several times a second. A panic is seen at the next look, a standstill within
-    /// 1.5 s.
+    /// Looks at the participant; call it several times a second. A panic is seen at the next look,
+    /// a standstill within 1.5 s.
     ///
     /// # Errors
     /// [`Illness`]: the participant must be replaced.
@@ -102,8 +104,7 @@ impl Pulse {
         }
         if self.last_beat.is_none_or(|at| now.duration_since(at) >= BEAT) {
             self.last_beat = Some(now);
-            self.reader
-                .set_waker(Some(Waker::from(Arc::new(Count(Arc::clone(&self.answers))))));
+            self.reader.set_waker(Some(Waker::from(Arc::new(Count(Arc::clone(&self.answers))))));
             self.writer.write(Bytes::from_static(b"?"));
         }
         match self.last_answer {
@@ -129,7 +130,8 @@ impl Pulse {
     }
 }
 
-/// Whether nobody holds a UDP port. The event loop owns its sockets: when it has unwound, its ports are free.
+/// Whether nobody holds a UDP port. The event loop owns its sockets: when it has unwound, its ports
+/// are free.
 pub(super) fn port_is_free(port: u16) -> bool {
     UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
 }

@@ -14,8 +14,8 @@ use super::sample::{Octets, OctetsAdapter};
 use super::{DdsError, GuidPrefix, create_error};
 use crate::wake::unpark_waker;
 
-/// Takes each sample and the participant that wrote it. It runs in the reader's thread: while it works, at most `depth`
-/// samples wait, then the oldest are lost.
+/// Takes each sample and the participant that wrote it. It runs in the reader's thread: while it
+/// works, at most `depth` samples wait, then the oldest are lost.
 pub type SampleSink = Box<dyn Fn(GuidPrefix, Bytes) + Send>;
 
 /// A safety net only: RustDDS wakes the thread.
@@ -63,7 +63,11 @@ impl Reader {
 }
 
 /// Takes what is there. Returns whether there was anything.
-fn drain(reader: &SimpleDataReader<Octets, OctetsAdapter>, sink: &SampleSink, malformed: &AtomicU64) -> bool {
+fn drain(
+    reader: &SimpleDataReader<Octets, OctetsAdapter>,
+    sink: &SampleSink,
+    malformed: &AtomicU64,
+) -> bool {
     let mut any = false;
     reader.drain_read_notifications();
     loop {
@@ -104,11 +108,7 @@ impl StoppableThread {
                 }
             })
             .map_err(create_error("thread"))?;
-        Ok(Self {
-            stop,
-            handle: Some(handle),
-            waited: true,
-        })
+        Ok(Self { stop, handle: Some(handle), waited: true })
     }
 
     /// Is not waited for on drop: it may be in a long call of the system.

@@ -1,9 +1,9 @@
 //! Discovery over unicast.
 //!
-//! RustDDS knows no initial peers. It does announce itself (SPDP) to the twelve participant slots of its own host, so
-//! the relay sits in one of them and repeats the announcement to the hosts that it knows. It also holds the two
-//! multicast ports of the domain, because RustDDS sends user data to a peer's multicast address as soon as the peer has
-//! one, and multicast does not cross routers.
+//! RustDDS knows no initial peers. It does announce itself (SPDP) to the twelve participant slots
+//! of its own host, so the relay sits in one of them and repeats the announcement to the hosts that
+//! it knows. It also holds the two multicast ports of the domain, because RustDDS sends user data
+//! to a peer's multicast address as soon as the peer has one, and multicast does not cross routers.
 
 use std::collections::{BTreeSet, HashSet, VecDeque};
 use std::io;
@@ -76,11 +76,12 @@ pub struct Relay {
 }
 
 impl Relay {
-    /// Holds the ports and starts to listen. Do this before the participant starts, or its first announcement is
-    /// missed and the next comes ten seconds later.
+    /// Holds the ports and starts to listen. Do this before the participant starts, or its first
+    /// announcement is missed and the next comes ten seconds later.
     ///
     /// # Errors
-    /// [`DdsError`] when there is no thread for it. Ports that are taken are no error: they are tried again each second.
+    /// [`DdsError`] when there is no thread for it. Ports that are taken are no error: they are
+    /// tried again each second.
     pub fn start(config: RelayConfig) -> Result<Self, DdsError> {
         let state = Arc::<Mutex<State>>::default();
         let config = Arc::new(config);
@@ -103,11 +104,7 @@ impl Relay {
             })?;
             threads.push(resolver.unwaited());
         }
-        Ok(Self {
-            state,
-            config,
-            _threads: threads,
-        })
+        Ok(Self { state, config, _threads: threads })
     }
 
     /// Whose announcement it is to repeat from now on.
@@ -117,7 +114,8 @@ impl Relay {
         state.told.clear();
     }
 
-    /// Adds hosts; those of this host are passed over. The one that was named least recently gives way beyond 256.
+    /// Adds hosts; those of this host are passed over. The one that was named least recently gives
+    /// way beyond 256.
     pub fn learn(&self, addresses: impl IntoIterator<Item = Ipv4Addr>) {
         let mut state = self.state.lock();
         for address in addresses {
@@ -128,7 +126,9 @@ impl Relay {
                 state.learnt.remove(place);
             }
             state.learnt.push_back(address);
-            while state.learnt.len() + state.configured.len() > MAX_ADDRESSES && state.learnt.len() > 1 {
+            while state.learnt.len() + state.configured.len() > MAX_ADDRESSES
+                && state.learnt.len() > 1
+            {
                 state.learnt.pop_front();
             }
         }
@@ -219,7 +219,8 @@ impl Ports {
             }
         }
         if self.slot.is_none() {
-            // From above, since participants take the lowest free slot. The lowest is left to a participant.
+            // From above, since participants take the lowest free slot. The lowest is left to a
+            // participant.
             self.slot = (1..LOCAL_SLOTS).rev().find_map(|slot| listen(config.domain, slot).ok());
         }
         if self.sender.is_none() {
@@ -292,18 +293,15 @@ fn hear(state: &Mutex<State>, datagram: &[u8]) {
     }
 }
 
-/// Sends the announcement to the hosts without a live flow: to all of them when `repeat`, else to those that never got
-/// this one.
+/// Sends the announcement to the hosts without a live flow: to all of them when `repeat`, else to
+/// those that never got this one.
 fn announce(config: &RelayConfig, state: &Mutex<State>, sender: &UdpSocket, repeat: bool) {
     static REFUSED: AtomicBool = AtomicBool::new(false);
     let (datagram, targets) = {
         let mut state = state.lock();
         let Some(own) = state.own else { return };
-        let Some(datagram) = state
-            .heard
-            .iter()
-            .find(|(prefix, _)| *prefix == own)
-            .map(|(_, bytes)| bytes.clone())
+        let Some(datagram) =
+            state.heard.iter().find(|(prefix, _)| *prefix == own).map(|(_, bytes)| bytes.clone())
         else {
             return;
         };
@@ -327,7 +325,11 @@ fn announce(config: &RelayConfig, state: &Mutex<State>, sender: &UdpSocket, repe
             if let Err(error) = sent
                 && !REFUSED.swap(true, Ordering::Relaxed)
             {
-                tracing::warn!(%address, %error, "a DDS announcement could not be sent; announcements are repeated");
+                tracing::warn!(
+                    %address,
+                    %error,
+                    "a DDS announcement could not be sent; announcements are repeated",
+                );
             }
         }
     }

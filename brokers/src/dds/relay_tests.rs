@@ -7,7 +7,9 @@ fn free_domain(from: u16) -> u16 {
         .map(|offset| (from + process + offset) % 100)
         .find(|domain| {
             let base = multicast_port(*domain);
-            free(base) && free(base + 1) && (0..LOCAL_SLOTS).all(|slot| free(announcement_port(*domain, slot)))
+            free(base)
+                && free(base + 1)
+                && (0..LOCAL_SLOTS).all(|slot| free(announcement_port(*domain, slot)))
         })
         .unwrap()
 }
@@ -45,10 +47,7 @@ fn multicast_ports_pass_to_the_next_relay_of_the_host() {
     drop(first);
     let begin = Instant::now();
     while !second.status().holds_multicast_ports {
-        assert!(
-            begin.elapsed() < Duration::from_secs(3),
-            "the ports were not taken over"
-        );
+        assert!(begin.elapsed() < Duration::from_secs(3), "the ports were not taken over");
         thread::sleep(Duration::from_millis(10));
     }
 }

@@ -1,4 +1,5 @@
-//! Samples as IDL `sequence<octet>`: a length of four bytes and the octets. RustDDS adds and strips the encapsulation.
+//! Samples as IDL `sequence<octet>`: a length of four bytes and the octets. RustDDS adds and strips
+//! the encapsulation.
 
 use std::io;
 
@@ -19,7 +20,8 @@ pub(super) struct OctetsAdapter;
 #[derive(Clone)]
 pub(super) struct OctetsDecoder;
 
-static ENCODINGS: [RepresentationIdentifier; 2] = [RepresentationIdentifier::CDR_LE, RepresentationIdentifier::CDR_BE];
+static ENCODINGS: [RepresentationIdentifier; 2] =
+    [RepresentationIdentifier::CDR_LE, RepresentationIdentifier::CDR_BE];
 
 fn decode(bytes: &[u8], encoding: RepresentationIdentifier) -> io::Result<Octets> {
     let malformed = || io::Error::new(io::ErrorKind::InvalidData, "not a sequence of octets");
@@ -30,14 +32,19 @@ fn decode(bytes: &[u8], encoding: RepresentationIdentifier) -> io::Result<Octets
         u32::from_le_bytes(*length)
     };
     let length = usize::try_from(length).map_err(|_| malformed())?;
-    // A copy of its own: the slice lies in a receive buffer of 256 KiB, which a small message would hold.
+    // A copy of its own: the slice lies in a receive buffer of 256 KiB, which a small message would
+    // hold.
     let octets = rest.get(..length).ok_or_else(malformed)?;
     Ok(Octets(Bytes::copy_from_slice(octets)))
 }
 
 impl no_key::Decode<'_, Octets> for OctetsDecoder {
     type Error = io::Error;
-    fn decode_bytes(self, bytes: &[u8], encoding: RepresentationIdentifier) -> Result<Octets, io::Error> {
+    fn decode_bytes(
+        self,
+        bytes: &[u8],
+        encoding: RepresentationIdentifier,
+    ) -> Result<Octets, io::Error> {
         decode(bytes, encoding)
     }
 }
@@ -83,14 +90,8 @@ mod tests {
         assert_eq!(&sample[..], b"\x05\0\0\0abcde");
         let mut padded = sample.to_vec();
         padded.extend_from_slice(&[0; 3]);
-        assert_eq!(
-            &decode(&padded, RepresentationIdentifier::CDR_LE).unwrap().0[..],
-            b"abcde"
-        );
-        assert_eq!(
-            &decode(b"\0\0\0\x01z", RepresentationIdentifier::CDR_BE).unwrap().0[..],
-            b"z"
-        );
+        assert_eq!(&decode(&padded, RepresentationIdentifier::CDR_LE).unwrap().0[..], b"abcde");
+        assert_eq!(&decode(b"\0\0\0\x01z", RepresentationIdentifier::CDR_BE).unwrap().0[..], b"z");
     }
 
     #[test]

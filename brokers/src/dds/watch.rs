@@ -18,7 +18,8 @@ use super::writer::{EndpointId, endpoint_of};
 use super::{DdsError, GuidPrefix};
 use crate::wake::unpark_waker;
 
-/// RustDDS drops events when its queue of 2048 is full, so all readers are looked at once in this time.
+/// RustDDS drops events when its queue of 2048 is full, so all readers are looked at once in this
+/// time.
 const RECONCILE: Duration = Duration::from_secs(1);
 
 /// A reader of another participant, of any topic.
@@ -78,21 +79,23 @@ impl EndpointWatch {
         let thread = StoppableThread::start("dds-watch", failed, move |stop| {
             watch(&participant, stop, &tell, || sink(endpoints(&participant, own, topics)));
         })?;
-        Ok(Self {
-            _thread: thread,
-            returned,
-        })
+        Ok(Self { _thread: thread, returned })
     }
 
-    /// Whether a participant came back that was lost before. RustDDS does not ask it for its readers and writers again, so
-    /// that this one must begin anew to meet it.
+    /// Whether a participant came back that was lost before. RustDDS does not ask it for its
+    /// readers and writers again, so that this one must begin anew to meet it.
     #[must_use]
     pub fn has_returned(&self) -> bool {
         self.returned.load(Ordering::Relaxed)
     }
 }
 
-fn watch(participant: &DomainParticipant, stop: &AtomicBool, returned: &AtomicBool, look: impl Fn()) {
+fn watch(
+    participant: &DomainParticipant,
+    stop: &AtomicBool,
+    returned: &AtomicBool,
+    look: impl Fn(),
+) {
     let listener = participant.status_listener();
     let mut events = listener.as_async_status_stream();
     let waker = unpark_waker();
@@ -137,7 +140,8 @@ fn watch(participant: &DomainParticipant, stop: &AtomicBool, returned: &AtomicBo
 fn endpoints(participant: &DomainParticipant, own: GuidPrefix, topics: &str) -> Endpoints {
     let readers = participant.discovered_readers();
     let writers = participant.discovered_writers();
-    let is_foreign = |guid: rustdds::GUID| guid.entity_id.kind().is_user_defined() && prefix_of(guid) != own;
+    let is_foreign =
+        |guid: rustdds::GUID| guid.entity_id.kind().is_user_defined() && prefix_of(guid) != own;
     Endpoints {
         readers: readers
             .iter()

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rustdds::dds::WriteError;
-use rustdds::{DataWriterStatus, RTPSEntity, StatusEvented, Timestamp, WriteOptionsBuilder, no_key};
+use rustdds::{
+    DataWriterStatus, RTPSEntity, StatusEvented, Timestamp, WriteOptionsBuilder, no_key,
+};
 
 use super::GuidPrefix;
 use super::sample::{Octets, OctetsAdapter};
@@ -39,12 +41,12 @@ pub enum Written {
     Failed,
 }
 
-/// A best-effort sample up to this size is sent at once or not at all; a larger one waits for room in the socket, and
-/// RustDDS then keeps it for six seconds.
+/// A best-effort sample up to this size is sent at once or not at all; a larger one waits for room
+/// in the socket, and RustDDS then keeps it for six seconds.
 const AT_ONCE_BYTES: usize = 2 * 1024 * 1024;
 
-/// Events that RustDDS keeps for a writer; it drops later ones. Each reader that asks for more than the writer offers makes
-/// one.
+/// Events that RustDDS keeps for a writer; it drops later ones. Each reader that asks for more than
+/// the writer offers makes one.
 const STATUS_EVENTS: usize = 4;
 
 /// Writes one topic. Never waits.
@@ -58,22 +60,23 @@ pub struct Writer {
 
 impl Writer {
     /// `keeps`: late joiners get what was written before they came.
-    pub(super) fn new(writer: no_key::DataWriter<Octets, OctetsAdapter>, keeps: bool, failed: Arc<AtomicBool>) -> Self {
-        Self {
-            writer,
-            matched: AtomicBool::new(false),
-            keeps,
-            failed,
-        }
+    pub(super) fn new(
+        writer: no_key::DataWriter<Octets, OctetsAdapter>,
+        keeps: bool,
+        failed: Arc<AtomicBool>,
+    ) -> Self {
+        Self { writer, matched: AtomicBool::new(false), keeps, failed }
     }
 
-    /// Hands a sample to RustDDS. Returns whether it was taken, as [`write_at`](Self::write_at) tells.
+    /// Hands a sample to RustDDS. Returns whether it was taken, as [`write_at`](Self::write_at)
+    /// tells.
     pub fn write(&self, octets: Bytes) -> bool {
         self.write_at(octets, None) == Written::Taken
     }
 
-    /// Hands a sample to RustDDS: not without a reader, unless it is kept for late joiners, and not into the full window of
-    /// a reliable writer. Best effort lets the oldest that still wait give way. `written` travels with the sample.
+    /// Hands a sample to RustDDS: not without a reader, unless it is kept for late joiners, and not
+    /// into the full window of a reliable writer. Best effort lets the oldest that still wait give
+    /// way. `written` travels with the sample.
     pub fn write_at(&self, octets: Bytes, written: Option<Timestamp>) -> Written {
         self.contain(|| {
             if !(self.is_matched_now() || self.keeps) {
@@ -97,8 +100,7 @@ impl Writer {
     /// Whether all readers have acknowledged all samples; always true for best effort.
     #[must_use]
     pub fn is_acknowledged(&self) -> bool {
-        self.contain(|| self.writer.wait_for_acknowledgments(Duration::ZERO).ok())
-            .unwrap_or(true)
+        self.contain(|| self.writer.wait_for_acknowledgments(Duration::ZERO).ok()).unwrap_or(true)
     }
 
     /// Its identity on the wire.
@@ -107,7 +109,8 @@ impl Writer {
         endpoint_of(self.writer.guid())
     }
 
-    /// Whether a reader is there. Where many came and went at once, it may say so although the last has gone.
+    /// Whether a reader is there. Where many came and went at once, it may say so although the last
+    /// has gone.
     #[must_use]
     pub fn is_matched(&self) -> bool {
         self.contain(|| self.is_matched_now().then_some(())).is_some()
@@ -122,7 +125,8 @@ impl Writer {
             }
         }
         if events >= STATUS_EVENTS {
-            // Others may have been lost. A sample without a reader costs nothing, a reader without its samples does.
+            // Others may have been lost. A sample without a reader costs nothing, a reader without
+            // its samples does.
             self.matched.store(true, Ordering::Relaxed);
         }
         self.matched.load(Ordering::Relaxed)

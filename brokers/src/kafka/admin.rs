@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rdkafka::admin::{
-    AdminClient, AdminOptions, AlterConfig, ConfigResource, ConfigSource, NewTopic, OwnedResourceSpecifier,
-    ResourceSpecifier, TopicReplication,
+    AdminClient, AdminOptions, AlterConfig, ConfigResource, ConfigSource, NewTopic,
+    OwnedResourceSpecifier, ResourceSpecifier, TopicReplication,
 };
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
 
@@ -24,7 +24,8 @@ pub(super) enum Purpose {
     Messages,
     /// The last value of each key.
     LastValues,
-    /// The same, of few and small values: what is old goes soon, so that whoever reads all has little to read.
+    /// The same, of few and small values: what is old goes soon, so that whoever reads all has
+    /// little to read.
     Notices,
 }
 
@@ -42,7 +43,9 @@ impl Purpose {
         ];
         settings.extend(match self {
             Self::Messages => [("retention.ms", "600000"), ("retention.bytes", "268435456")],
-            Self::LastValues | Self::Notices => [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")],
+            Self::LastValues | Self::Notices => {
+                [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")]
+            }
         });
         settings
     }
@@ -60,19 +63,24 @@ impl Purpose {
 pub(super) struct Admin(AdminClient<ReadContext>);
 
 impl Admin {
-    pub(super) fn new(settings: &Settings, last_error: &Arc<LastError>) -> Result<Self, KafkaError> {
+    pub(super) fn new(
+        settings: &Settings,
+        last_error: &Arc<LastError>,
+    ) -> Result<Self, KafkaError> {
         let context = ReadContext::new(&Arc::default(), last_error);
         settings.admin().create_with_context(context).map(Self)
     }
 
     fn options() -> AdminOptions {
-        AdminOptions::new()
-            .request_timeout(Some(TIMEOUT))
-            .operation_timeout(Some(TIMEOUT))
+        AdminOptions::new().request_timeout(Some(TIMEOUT)).operation_timeout(Some(TIMEOUT))
     }
 
-    /// Makes topics, and waits for it. Returns those that could not be made; one that is there already is none of them.
-    pub(super) fn make(&self, topics: &[(Arc<str>, Purpose)]) -> Result<Vec<(Arc<str>, RDKafkaErrorCode)>, KafkaError> {
+    /// Makes topics, and waits for it. Returns those that could not be made; one that is there
+    /// already is none of them.
+    pub(super) fn make(
+        &self,
+        topics: &[(Arc<str>, Purpose)],
+    ) -> Result<Vec<(Arc<str>, RDKafkaErrorCode)>, KafkaError> {
         let new: Vec<NewTopic<'_>> = topics
             .iter()
             .map(|(name, purpose)| {
@@ -94,8 +102,12 @@ impl Admin {
     }
 
     /// The largest batches that the server takes of topics, in bytes; of those that it tells.
-    pub(super) fn largest_batches(&self, topics: &[Arc<str>]) -> Result<HashMap<Arc<str>, usize>, KafkaError> {
-        let resources: Vec<ResourceSpecifier<'_>> = topics.iter().map(|name| ResourceSpecifier::Topic(name)).collect();
+    pub(super) fn largest_batches(
+        &self,
+        topics: &[Arc<str>],
+    ) -> Result<HashMap<Arc<str>, usize>, KafkaError> {
+        let resources: Vec<ResourceSpecifier<'_>> =
+            topics.iter().map(|name| ResourceSpecifier::Topic(name)).collect();
         let found = block_on(self.0.describe_configs(&resources, &Self::options()))?;
         let limit = |config: ConfigResource| {
             let OwnedResourceSpecifier::Topic(name) = &config.specifier else {
@@ -122,7 +134,9 @@ impl Admin {
         let set_before = config
             .entries
             .iter()
-            .filter(|entry| entry.source == ConfigSource::DynamicTopic && entry.name != "cleanup.policy")
+            .filter(|entry| {
+                entry.source == ConfigSource::DynamicTopic && entry.name != "cleanup.policy"
+            })
             .filter_map(|entry| Some((entry.name.as_str(), entry.value.as_deref()?)));
         let change = set_before.fold(
             AlterConfig::new(resource).set("cleanup.policy", "compact"),

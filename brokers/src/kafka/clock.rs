@@ -1,9 +1,9 @@
 //! How old a record is, by the broker's clock, which may differ from ours.
 //!
-//! Two things tell of it: an own record was appended between its sending and its acknowledgement; and a record that arrives
-//! was appended before. The first gives an estimate with half the round trip as its error, of which the best of the last
-//! minute counts; the second a bound below, which alone makes ages too small by the shortest delivery. Our own wall clock is
-//! never asked.
+//! Two things tell of it: an own record was appended between its sending and its acknowledgement;
+//! and a record that arrives was appended before. The first gives an estimate with half the round
+//! trip as its error, of which the best of the last minute counts; the second a bound below, which
+//! alone makes ages too small by the shortest delivery. Our own wall clock is never asked.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -32,17 +32,13 @@ pub(super) struct BrokerClock {
 impl BrokerClock {
     /// Knows nothing yet.
     pub(super) fn new(now: Instant) -> Self {
-        Self {
-            base: now,
-            estimates: VecDeque::new(),
-            bounds: [None; 2],
-            bounds_since: now,
-        }
+        Self { base: now, estimates: VecDeque::new(), bounds: [None; 2], bounds_since: now }
     }
 
     fn micros(&self, at: Instant) -> i64 {
-        let since =
-            |a: Instant, b: Instant| i64::try_from(a.saturating_duration_since(b).as_micros()).unwrap_or(i64::MAX);
+        let since = |a: Instant, b: Instant| {
+            i64::try_from(a.saturating_duration_since(b).as_micros()).unwrap_or(i64::MAX)
+        };
         since(at, self.base) - since(self.base, at)
     }
 
@@ -50,23 +46,17 @@ impl BrokerClock {
         append_ms.saturating_mul(1000).saturating_add(HALF_TICK_US)
     }
 
-    /// An own record was handed over at `sent`, is acknowledged now, and was appended at `append_ms` of the broker's clock.
+    /// An own record was handed over at `sent`, is acknowledged now, and was appended at
+    /// `append_ms` of the broker's clock.
     pub(super) fn acknowledged(&mut self, sent: Instant, now: Instant, append_ms: i64) {
         let (from, to) = (self.micros(sent), self.micros(now));
         let round_trip_us = to.saturating_sub(from);
-        let offset_us = Self::stamp(append_ms).saturating_sub(from.saturating_add(round_trip_us / 2));
-        while self
-            .estimates
-            .back()
-            .is_some_and(|last| last.round_trip_us >= round_trip_us)
-        {
+        let offset_us =
+            Self::stamp(append_ms).saturating_sub(from.saturating_add(round_trip_us / 2));
+        while self.estimates.back().is_some_and(|last| last.round_trip_us >= round_trip_us) {
             self.estimates.pop_back();
         }
-        self.estimates.push_back(Estimate {
-            at: now,
-            round_trip_us,
-            offset_us,
-        });
+        self.estimates.push_back(Estimate { at: now, round_trip_us, offset_us });
         while self.estimates.len() > 1
             && let Some(first) = self.estimates.front()
             && now.saturating_duration_since(first.at) > WINDOW

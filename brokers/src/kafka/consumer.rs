@@ -1,15 +1,17 @@
-//! Reading: one client reads the partitions of all its topics, and one thread hands the records to the readers.
+//! Reading: one client reads the partitions of all its topics, and one thread hands the records to
+//! the readers.
 //!
 //! ```text
 //! server ─► librdkafka (bounded queue) ─► thread: position, identity, header ─► rings of the topic's readers
 //! ```
 //!
-//! The position of each partition is ours: librdkafka gets it with the assignment and never decides by itself. A reader
-//! gets records at or behind the end that it saw when it subscribed. A topic that was made anew has another identity, which
-//! this client learns before it gets a record of it: it is then read from its beginning, for all its readers.
+//! The position of each partition is ours: librdkafka gets it with the assignment and never decides
+//! by itself. A reader gets records at or behind the end that it saw when it subscribed. A topic
+//! that was made anew has another identity, which this client learns before it gets a record of it:
+//! it is then read from its beginning, for all its readers.
 //!
-//! Records are polled and handed out under the lock under which assignments change, so no record of an earlier position
-//! comes after a change.
+//! Records are polled and handed out under the lock under which assignments change, so no record of
+//! an earlier position comes after a change.
 
 #[cfg(test)]
 mod tests;
@@ -76,7 +78,8 @@ pub(super) struct Source {
 /// A reader could not be taken in.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Refused {
-    /// The topic's other readers are beyond where this one would begin: it must first read up to here by itself.
+    /// The topic's other readers are beyond where this one would begin: it must first read up to
+    /// here by itself.
     Behind(Vec<i64>),
     /// The client did not take it.
     Failed(String),
@@ -90,7 +93,8 @@ pub(super) enum Join<'a> {
     Following,
     /// What lies before that is read once more, for it alone.
     Rewinding,
-    /// It gets what is kept first, and is refused if records between that and what is read next have been read already.
+    /// It gets what is kept first, and is refused if records between that and what is read next
+    /// have been read already.
     AfterKept(&'a mut dyn FnMut() -> Vec<Received>),
 }
 
@@ -127,7 +131,11 @@ pub(super) struct Consumer {
 
 impl Consumer {
     /// Makes the client and its thread.
-    pub(super) fn start(large: bool, layer: &str, shared: &Arc<Shared>) -> Result<Arc<Self>, String> {
+    pub(super) fn start(
+        large: bool,
+        layer: &str,
+        shared: &Arc<Shared>,
+    ) -> Result<Arc<Self>, String> {
         let consumer = Arc::new(Self::new(large, layer, shared)?);
         let name = if large { "kafka-read-l" } else { "kafka-read" };
         let reading = Arc::clone(&consumer);
@@ -170,7 +178,8 @@ impl Consumer {
     async fn run(&self) {
         while let Some(client) = self.client() {
             let mut stream = client.stream();
-            let read = std::future::poll_fn(|context| self.hand_out(&client, &mut stream, context, BATCH));
+            let read =
+                std::future::poll_fn(|context| self.hand_out(&client, &mut stream, context, BATCH));
             tokio::select! {
                 () = read => {}
                 () = self.replaced.notified() => {}
@@ -178,7 +187,8 @@ impl Consumer {
         }
     }
 
-    /// Hands out what a client has, up to a limit; then others have a turn. Ready when it is not the client any more.
+    /// Hands out what a client has, up to a limit; then others have a turn. Ready when it is not
+    /// the client any more.
     fn hand_out(
         &self,
         client: &Arc<Client>,
@@ -192,7 +202,8 @@ impl Consumer {
         }
         for _ in 0..limit {
             let next = Pin::new(&mut *stream).poll_next(context);
-            // Also without a record: at the position of before there may be none of the topic that was made anew.
+            // Also without a record: at the position of before there may be none of the topic that
+            // was made anew.
             let anew = self.follow_identities(&mut state, client);
             let Poll::Ready(next) = next else {
                 return Poll::Pending;
@@ -264,12 +275,12 @@ impl Consumer {
         let identity = partition.bare_writer.zip(u64::try_from(offset + 1).ok());
         // A tombstone takes away; there is nothing to deliver.
         let Some(payload) = message.payload() else { return };
-        let wanted = |reader: &Reader| reader.starts.get(number).is_none_or(|start| offset >= *start);
+        let wanted =
+            |reader: &Reader| reader.starts.get(number).is_none_or(|start| offset >= *start);
         if topic.readers.iter().any(wanted) {
-            let received = receive(&topic.source.channel, message, payload, identity, &self.shared.clock);
-            topic
-                .readers
-                .retain(|reader| !wanted(reader) || reader.sender.send(received.clone()));
+            let received =
+                receive(&topic.source.channel, message, payload, identity, &self.shared.clock);
+            topic.readers.retain(|reader| !wanted(reader) || reader.sender.send(received.clone()));
         }
         if topic.readers.is_empty() {
             topic.unassign(client);
@@ -279,11 +290,11 @@ impl Consumer {
 
     /// Whether the client gets an answer of the server. Waits for it.
     pub(super) fn is_answered(&self, topic: &str, timeout: Duration) -> bool {
-        self.client()
-            .is_none_or(|client| client.fetch_metadata(Some(topic), timeout).is_ok())
+        self.client().is_none_or(|client| client.fetch_metadata(Some(topic), timeout).is_ok())
     }
 
-    /// Begins anew with a client that knows nothing; it reads on where the old one stood. Blocks while that one ends.
+    /// Begins anew with a client that knows nothing; it reads on where the old one stood. Blocks
+    /// while that one ends.
     pub(super) fn remake(&self) -> Result<(), String> {
         let made = self.connect()?;
         let old = {
@@ -297,7 +308,8 @@ impl Consumer {
             std::mem::replace(client, made)
         };
         self.replaced.notify_one();
-        // The thread that reads has the old one for a moment yet. If it were the last, it would read nothing while that one ends.
+        // The thread that reads has the old one for a moment yet. If it were the last, it would
+        // read nothing while that one ends.
         let until = Instant::now() + LEAVE;
         while Arc::strong_count(&old) > 1 && Instant::now() < until {
             std::thread::sleep(LEAVE_TURN);
@@ -306,7 +318,8 @@ impl Consumer {
         Ok(())
     }
 
-    /// Takes a reader in that begins at the given offsets. `info` is what the server said of the topic just before.
+    /// Takes a reader in that begins at the given offsets. `info` is what the server said of the
+    /// topic just before.
     pub(super) fn add(
         &self,
         source: &Source,
@@ -317,18 +330,12 @@ impl Consumer {
     ) -> Result<(), Refused> {
         self.learn(&source.topic);
         let mut state = self.state.lock();
-        let State {
-            client: Some(client),
-            topics,
-            ..
-        } = &mut *state
-        else {
+        let State { client: Some(client), topics, .. } = &mut *state else {
             return Err(Refused::Closed);
         };
         let known = topics.contains_key(&source.topic);
-        let topic = topics
-            .entry(Arc::clone(&source.topic))
-            .or_insert_with(|| TopicState::new(source));
+        let topic =
+            topics.entry(Arc::clone(&source.topic)).or_insert_with(|| TopicState::new(source));
         if !known {
             topic.begin_at(&starts, info, &self.layer);
             if !topic.assign(client) {
@@ -359,12 +366,19 @@ impl Consumer {
     }
 
     /// Takes a reader in of a topic that is not there yet.
-    pub(super) fn add_awaiting(&self, source: &Source, sender: SubscriptionSender) -> Result<(), Refused> {
+    pub(super) fn add_awaiting(
+        &self,
+        source: &Source,
+        sender: SubscriptionSender,
+    ) -> Result<(), Refused> {
         let mut state = self.state.lock();
         if state.client.is_none() {
             return Err(Refused::Closed);
         }
-        tracing::debug!(topic = %source.topic, "the topic is not there yet; it is read as soon as it is");
+        tracing::debug!(
+            topic = %source.topic,
+            "the topic is not there yet; it is read as soon as it is",
+        );
         let topic = state.topics.entry(Arc::clone(&source.topic));
         let topic = topic.or_insert_with(|| TopicState::new(source));
         let starts = Vec::new();
@@ -437,9 +451,16 @@ impl Consumer {
         }
     }
 
-    /// Brings the reading of a topic into line with what the server says of it: begins, reads new partitions, asks again for
-    /// what stands still. `lost_position`: looks whether the server has what is to be read next.
-    pub(super) fn follow(&self, now: Instant, name: &str, (info, marks): (&TopicInfo, &[Marks]), lost_position: bool) {
+    /// Brings the reading of a topic into line with what the server says of it: begins, reads new
+    /// partitions, asks again for what stands still. `lost_position`: looks whether the server has
+    /// what is to be read next.
+    pub(super) fn follow(
+        &self,
+        now: Instant,
+        name: &str,
+        (info, marks): (&TopicInfo, &[Marks]),
+        lost_position: bool,
+    ) {
         let mut state = self.state.lock();
         let State { client, topics, .. } = &mut *state;
         let (Some(client), Some(topic)) = (client, topics.get_mut(name)) else {

@@ -24,14 +24,17 @@ impl LastError {
     }
 }
 
-/// Routes the log of a client into ours. librdkafka repeats itself at each attempt to connect, so all but what makes it
-/// useless is for those who debug: what matters is told once, as the broker's status.
+/// Routes the log of a client into ours. librdkafka repeats itself at each attempt to connect, so
+/// all but what makes it useless is for those who debug: what matters is told once, as the broker's
+/// status.
 pub(super) fn log(level: RDKafkaLogLevel, facility: &str, line: &str) {
     match level {
         RDKafkaLogLevel::Emerg | RDKafkaLogLevel::Alert | RDKafkaLogLevel::Critical => {
             tracing::warn!(target: "librdkafka", facility, "{line}");
         }
-        RDKafkaLogLevel::Error | RDKafkaLogLevel::Warning => tracing::debug!(target: "librdkafka", facility, "{line}"),
+        RDKafkaLogLevel::Error | RDKafkaLogLevel::Warning => {
+            tracing::debug!(target: "librdkafka", facility, "{line}")
+        }
         RDKafkaLogLevel::Notice | RDKafkaLogLevel::Info | RDKafkaLogLevel::Debug => {
             tracing::trace!(target: "librdkafka", facility, "{line}");
         }
@@ -48,10 +51,7 @@ pub(super) struct ReadContext {
 
 impl ReadContext {
     pub(super) fn new(identities: &Arc<Identities>, last_error: &Arc<LastError>) -> Self {
-        Self {
-            identities: Arc::clone(identities),
-            last_error: Arc::clone(last_error),
-        }
+        Self { identities: Arc::clone(identities), last_error: Arc::clone(last_error) }
     }
 }
 

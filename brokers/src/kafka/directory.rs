@@ -107,11 +107,7 @@ impl Directory {
     pub(super) fn remake(&self) -> Result<(), KafkaError> {
         let made = self.connect()?;
         // Once closed it stays closed.
-        let old = self
-            .client
-            .lock()
-            .as_mut()
-            .map(|client| std::mem::replace(client, made));
+        let old = self.client.lock().as_mut().map(|client| std::mem::replace(client, made));
         drop(old);
         Ok(())
     }
@@ -121,13 +117,19 @@ impl Directory {
     }
 
     /// Asks for all topics, or for one. Waits for the answer.
-    pub(super) fn list(&self, topic: Option<&str>, timeout: Duration) -> Result<Listing, LookupError> {
+    pub(super) fn list(
+        &self,
+        topic: Option<&str>,
+        timeout: Duration,
+    ) -> Result<Listing, LookupError> {
         let client = self.client()?;
         let metadata = client.fetch_metadata(topic, timeout);
-        // Serves all there is of the client's log and errors: without a time it would serve one line alone.
+        // Serves all there is of the client's log and errors: without a time it would serve one
+        // line alone.
         client.poll(IDENTITY_TURN);
         let metadata = metadata?;
-        let good = |topic: &&MetadataTopic| topic.error().is_none() && !topic.partitions().is_empty();
+        let good =
+            |topic: &&MetadataTopic| topic.error().is_none() && !topic.partitions().is_empty();
         let topics = metadata.topics().iter().filter(good);
         Ok(Listing {
             brokers: metadata.brokers().len(),
@@ -139,10 +141,7 @@ impl Directory {
 
     /// The identity of the cluster, if it is known soon.
     pub(super) fn cluster(&self) -> Option<String> {
-        self.client()
-            .ok()?
-            .client()
-            .fetch_cluster_id(Duration::from_millis(200))
+        self.client().ok()?.client().fetch_cluster_id(Duration::from_millis(200))
     }
 
     /// Looks a topic up. Waits for the answer.
@@ -163,10 +162,7 @@ impl Directory {
                 break;
             }
         }
-        Ok(TopicInfo {
-            uuid: self.identities.of(topic),
-            partitions,
-        })
+        Ok(TopicInfo { uuid: self.identities.of(topic), partitions })
     }
 
     /// What is known of a topic's identity without asking.
@@ -175,7 +171,12 @@ impl Directory {
     }
 
     /// Where the partitions of a topic begin and end now. Waits for the answers.
-    pub(super) fn marks(&self, topic: &str, partitions: usize, deadline: Instant) -> Result<Vec<Marks>, LookupError> {
+    pub(super) fn marks(
+        &self,
+        topic: &str,
+        partitions: usize,
+        deadline: Instant,
+    ) -> Result<Vec<Marks>, LookupError> {
         let client = self.client()?;
         let mark = |partition: usize| loop {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -189,8 +190,8 @@ impl Directory {
         (0..partitions).map(mark).collect()
     }
 
-    /// The first offset of each partition whose record the server took at that time of its clock, in milliseconds since 1970,
-    /// or later; `None` where there is none. Waits for the answer.
+    /// The first offset of each partition whose record the server took at that time of its clock,
+    /// in milliseconds since 1970, or later; `None` where there is none. Waits for the answer.
     pub(super) fn since(
         &self,
         topic: &str,

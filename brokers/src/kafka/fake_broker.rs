@@ -1,5 +1,5 @@
-//! A server for tests that answers questions for metadata, and sometimes names no broker: so does a real one that has lost itself for
-//! a moment, after a pause or while it starts.
+//! A server for tests that answers questions for metadata, and sometimes names no broker: so does a
+//! real one that has lost itself for a moment, after a pause or while it starts.
 
 use std::io::{Read as _, Write as _};
 use std::net::{TcpListener, TcpStream};
@@ -74,7 +74,8 @@ fn serve(mut stream: TcpStream, port: u16, state: &State) -> Option<()> {
         while state.silent.load(Ordering::SeqCst) {
             std::thread::sleep(std::time::Duration::from_millis(10));
         }
-        let number = |at: usize| Some(i16::from_be_bytes(request.get(at..at + 2)?.try_into().ok()?));
+        let number =
+            |at: usize| Some(i16::from_be_bytes(request.get(at..at + 2)?.try_into().ok()?));
         let (key, version) = (number(0)?, number(2)?);
         let mut answer = request.get(4..8)?.to_vec();
         match key {
@@ -82,9 +83,7 @@ fn serve(mut stream: TcpStream, port: u16, state: &State) -> Option<()> {
             METADATA => metadata(&mut answer, &request, port, state)?,
             _ => return None,
         }
-        stream
-            .write_all(&i32::try_from(answer.len()).ok()?.to_be_bytes())
-            .ok()?;
+        stream.write_all(&i32::try_from(answer.len()).ok()?.to_be_bytes()).ok()?;
         stream.write_all(&answer).ok()?;
     }
 }

@@ -1,4 +1,5 @@
-//! What the flow of a layer does on its Kafka, beside messages: topics, leases, what is kept of writers.
+//! What the flow of a layer does on its Kafka, beside messages: topics, leases, what is kept of
+//! writers.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -69,13 +70,8 @@ impl FlowState {
         let known = || inner.directory.known_identity(name);
         let ask = || inner.directory.topic(name, Duration::from_secs(1)).ok()?.uuid;
         let uuid = if is_there { known().or_else(ask) } else { None };
-        let before = std::mem::replace(
-            &mut *self.leases_seen.lock(),
-            Seen {
-                is_there,
-                uuid: uuid.clone(),
-            },
-        );
+        let before =
+            std::mem::replace(&mut *self.leases_seen.lock(), Seen { is_there, uuid: uuid.clone() });
         let is_another = matches!((before.uuid, uuid), (Some(before), Some(now)) if before != now);
         if is_there && (!before.is_there || is_another) {
             self.write_all_leases();
@@ -83,7 +79,8 @@ impl FlowState {
     }
 
     fn write_all_leases(&self) {
-        // Locked until all are handed over: a lease that is removed meanwhile must not be overtaken by its old value.
+        // Locked until all are handed over: a lease that is removed meanwhile must not be overtaken
+        // by its old value.
         let mirror = self.mirror.lock();
         if !mirror.is_empty() {
             tracing::info!(
@@ -130,11 +127,7 @@ pub(super) struct KafkaFlowSide {
 #[async_trait]
 impl FlowSide for KafkaFlowSide {
     fn prepare(&self, channel: &ChannelName, depth: u32) -> Result<(), BrokerError> {
-        let purpose = if depth > 0 {
-            Purpose::LastValues
-        } else {
-            Purpose::Messages
-        };
+        let purpose = if depth > 0 { Purpose::LastValues } else { Purpose::Messages };
         self.state.creator.prepare(&self.inner, channel, purpose, depth)
     }
 
@@ -159,9 +152,7 @@ impl FlowSide for KafkaFlowSide {
         if mirror.len() < MAX_LEASES || mirror.contains_key(key) {
             mirror.insert(key.to_owned(), value.clone());
         }
-        self.state
-            .keyed
-            .put(&self.state.leases, None, key.to_owned(), Some(value));
+        self.state.keyed.put(&self.state.leases, None, key.to_owned(), Some(value));
     }
 
     fn remove_lease(&self, key: &str) {
@@ -174,10 +165,8 @@ impl FlowSide for KafkaFlowSide {
         let Ok(name) = self.inner.names.topic(channel) else {
             return;
         };
-        let known = self
-            .state
-            .creator
-            .with(&name, |prepared| (prepared.topic.clone(), prepared.depth));
+        let known =
+            self.state.creator.with(&name, |prepared| (prepared.topic.clone(), prepared.depth));
         let Some((Some(topic), depth)) = known else { return };
         // A topic that is not there keeps nothing.
         let Some(partitions) = topic.partitions() else { return };
@@ -190,7 +179,9 @@ impl FlowSide for KafkaFlowSide {
 
     fn stand_back(&self, for_whom: Option<String>) {
         let back = for_whom.is_some();
-        if std::mem::replace(&mut *self.state.stood_back.lock(), for_whom).is_some() == back && !back {
+        if std::mem::replace(&mut *self.state.stood_back.lock(), for_whom).is_some() == back
+            && !back
+        {
             return;
         }
         self.inner.stand_back(back);

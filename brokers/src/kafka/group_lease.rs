@@ -1,4 +1,5 @@
-//! A lease as membership of a consumer group: the member that has the one partition of a topic has the lease.
+//! A lease as membership of a consumer group: the member that has the one partition of a topic has
+//! the lease.
 //!
 //! ```text
 //! hold(note) ─► thread ─► assigned? no: what was committed last ─► not held
@@ -6,11 +7,12 @@
 //!                 └─► polls on in between; leaves the group when nobody asks any more
 //! ```
 //!
-//! The coordinator takes a commit only from a member of the present generation, and counts it as a heartbeat. So after a
-//! commit the partition stays for the session timeout, which is longer than the lease is held; the assignor is
-//! cooperative and sticky, so a member that joins or leaves takes it from nobody. Where it is taken nevertheless, the
-//! client gives it back only when the lease that was told is over. The topic stays empty: the note is the metadata of the
-//! committed offset.
+//! The coordinator takes a commit only from a member of the present generation, and counts it as a
+//! heartbeat. So after a commit the partition stays for the session timeout, which is longer than
+//! the lease is held; the assignor is cooperative and sticky, so a member that joins or leaves
+//! takes it from nobody. Where it is taken nevertheless, the client gives it back only when the
+//! lease that was told is over. The topic stays empty: the note is the metadata of the committed
+//! offset.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
@@ -58,14 +60,12 @@ pub struct GroupLeaseOptions {
 }
 
 enum Question {
-    Hold {
-        note: Option<String>,
-        answer: oneshot::Sender<Result<Held, String>>,
-    },
+    Hold { note: Option<String>, answer: oneshot::Sender<Result<Held, String>> },
     Release(oneshot::Sender<()>),
 }
 
-/// A member that wants the lease. Dropped without [`GroupLease::release`], it leaves the group as well.
+/// A member that wants the lease. Dropped without [`GroupLease::release`], it leaves the group as
+/// well.
 pub struct GroupLease {
     questions: SyncSender<Question>,
     stop: CancellationToken,
@@ -74,7 +74,8 @@ pub struct GroupLease {
 }
 
 impl GroupLease {
-    /// Begins to connect, in the background; makes the topic if there is none. Must be called on a Tokio runtime.
+    /// Begins to connect, in the background; makes the topic if there is none. Must be called on a
+    /// Tokio runtime.
     ///
     /// # Errors
     /// [`OpenError`] as for a broker of this section.
@@ -101,35 +102,32 @@ impl GroupLease {
                 key: "kafka".to_owned(),
                 reason: error.to_string(),
             })?;
-        Ok(Self {
-            questions,
-            stop,
-            _supervisor: supervisor,
-        })
+        Ok(Self { questions, stop, _supervisor: supervisor })
     }
 
-    /// Asks whether this member has the lease, for its time from before the call. A member that had it at the last call, too,
-    /// leaves `note`; one that has got it since does not, and learns what the one before has left.
+    /// Asks whether this member has the lease, for its time from before the call. A member that had
+    /// it at the last call, too, leaves `note`; one that has got it since does not, and learns what
+    /// the one before has left.
     ///
     /// # Errors
     /// For people: nobody knows.
     pub async fn hold(&self, note: Option<&str>) -> Result<Held, String> {
         let (answer, answered) = oneshot::channel();
-        let question = Question::Hold {
-            note: note.map(str::to_owned),
-            answer,
-        };
+        let question = Question::Hold { note: note.map(str::to_owned), answer };
         self.questions.try_send(question).map_err(|error| match error {
-            TrySendError::Full(_) => "the broker has not answered the last questions yet".to_owned(),
+            TrySendError::Full(_) => {
+                "the broker has not answered the last questions yet".to_owned()
+            }
             TrySendError::Disconnected(_) => GIVEN_UP.to_owned(),
         })?;
         answered.await.unwrap_or_else(|_| Err(GIVEN_UP.to_owned()))
     }
 
-    /// Leaves the group, so that another member has it at once; it is not asked for again. The caller no longer acts as
-    /// the owner.
+    /// Leaves the group, so that another member has it at once; it is not asked for again. The
+    /// caller no longer acts as the owner.
     pub async fn release(&self) {
-        // Before the question, which the thread does not see while it waits for the end of the lease.
+        // Before the question, which the thread does not see while it waits for the end of the
+        // lease.
         self.stop.cancel();
         let (answer, answered) = oneshot::channel();
         if self.questions.try_send(Question::Release(answer)).is_ok() {
@@ -215,10 +213,13 @@ struct Member {
 impl Member {
     fn run(mut self, questions: &Receiver<Question>) {
         while !self.stop.is_cancelled() {
-            let question = questions.recv_timeout(if self.consumer.is_some() { TURN } else { AGAIN });
+            let question =
+                questions.recv_timeout(if self.consumer.is_some() { TURN } else { AGAIN });
             match question {
                 // Whoever asked has given up waiting, and asks again.
-                Ok(Question::Hold { answer, .. }) if answer.is_closed() => self.asked = Some(Instant::now()),
+                Ok(Question::Hold { answer, .. }) if answer.is_closed() => {
+                    self.asked = Some(Instant::now())
+                }
                 Ok(Question::Hold { note, answer }) => {
                     let held = self.hold(note);
                     self.is_held = held.as_ref().is_ok_and(|held| held.is_held);
@@ -233,7 +234,9 @@ impl Member {
                     return;
                 }
                 // The client stays a member by itself, whatever becomes of the one who asks.
-                Err(RecvTimeoutError::Timeout) if self.asked.is_some_and(|at| at.elapsed() > self.options.time) => {
+                Err(RecvTimeoutError::Timeout)
+                    if self.asked.is_some_and(|at| at.elapsed() > self.options.time) =>
+                {
                     self.leave();
                 }
                 Err(RecvTimeoutError::Timeout) => {}
@@ -274,13 +277,9 @@ impl Member {
     fn make_topic(&self) -> Result<(), String> {
         let away = |error: KafkaError| self.last_error.take().unwrap_or_else(|| error.to_string());
         let admin = Admin::new(&self.settings, &self.last_error).map_err(away)?;
-        let refused = admin
-            .make(&[(Arc::clone(&self.topic), Purpose::Notices)])
-            .map_err(away)?;
+        let refused = admin.make(&[(Arc::clone(&self.topic), Purpose::Notices)]).map_err(away)?;
         refused.first().map_or(Ok(()), |(topic, code)| {
-            Err(format!(
-                "the topic {topic} could not be made, so an administrator has to: {code}"
-            ))
+            Err(format!("the topic {topic} could not be made, so an administrator has to: {code}"))
         })
     }
 
@@ -333,10 +332,16 @@ impl Member {
         trouble.filter(|_| !is_held).map_or(held, Err)
     }
 
-    fn ask(&mut self, consumer: &BaseConsumer<Context>, note: Option<String>, now: Instant) -> KafkaResult<Held> {
+    fn ask(
+        &mut self,
+        consumer: &BaseConsumer<Context>,
+        note: Option<String>,
+        now: Instant,
+    ) -> KafkaResult<Held> {
         let is_own = || {
             let assigned = consumer.assignment();
-            let is_assigned = assigned.is_ok_and(|assigned| assigned.find_partition(&self.topic, PARTITION).is_some());
+            let is_assigned = assigned
+                .is_ok_and(|assigned| assigned.find_partition(&self.topic, PARTITION).is_some());
             is_assigned && !consumer.assignment_lost()
         };
         let is_assigned = is_own();
@@ -347,8 +352,9 @@ impl Member {
         };
         self.note = note.or(self.note.take());
         if is_assigned {
-            // The callback of a commit that does not wait is never called by this client. One that waits does so for
-            // `socket.timeout.ms`, and while the coordinator is away for the session timeout as well.
+            // The callback of a commit that does not wait is never called by this client. One that
+            // waits does so for `socket.timeout.ms`, and while the coordinator is away for the
+            // session timeout as well.
             consumer.commit(&position(&self.topic, self.note.as_deref())?, CommitMode::Sync)?;
         }
         let is_held = is_assigned && is_own();
@@ -356,10 +362,7 @@ impl Member {
             self.is_warned = false;
             *consumer.context().promised.lock() = Some(now + self.options.time);
         }
-        Ok(Held {
-            is_held,
-            note: self.note.clone(),
-        })
+        Ok(Held { is_held, note: self.note.clone() })
     }
 }
 
@@ -390,7 +393,11 @@ fn position(topic: &str, note: Option<&str>) -> KafkaResult<TopicPartitionList> 
 }
 
 /// The note that was committed last.
-fn committed(consumer: &BaseConsumer<Context>, topic: &str, patience: Duration) -> KafkaResult<Option<String>> {
+fn committed(
+    consumer: &BaseConsumer<Context>,
+    topic: &str,
+    patience: Duration,
+) -> KafkaResult<Option<String>> {
     let found = consumer.committed_offsets(position(topic, None)?, patience)?;
     let Some(partition) = found.find_partition(topic, PARTITION) else {
         return Ok(None);

@@ -1,5 +1,5 @@
-//! One thread per broker asks the server for an answer, makes the topics that must be there, and brings the clients into line
-//! with what the server has.
+//! One thread per broker asks the server for an answer, makes the topics that must be there, and
+//! brings the clients into line with what the server has.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,7 +13,8 @@ use super::settings::Lot;
 
 /// How long the server has for an answer.
 const ANSWER: Duration = Duration::from_secs(1);
-/// How often the server is asked while all is well: with the time for the answer below the 2 s in which a loss must show.
+/// How often the server is asked while all is well: with the time for the answer below the 2 s in
+/// which a loss must show.
 const CALM: Duration = Duration::from_millis(700);
 /// How often while something is missing.
 const BUSY: Duration = Duration::from_millis(200);
@@ -26,8 +27,9 @@ const PER_ROUND: usize = 8;
 const LOOK: Duration = Duration::from_secs(5);
 /// How long such an answer may take: another client got one just before.
 const QUICK: Duration = Duration::from_millis(300);
-/// A client that gets no answer for this long while the server gives some is made anew. The client library takes brokers that an answer
-/// does not name off its list; of a server that named none, because it had lost itself for a moment, it then never hears again.
+/// A client that gets no answer for this long while the server gives some is made anew. The client
+/// library takes brokers that an answer does not name off its list; of a server that named none,
+/// because it had lost itself for a moment, it then never hears again.
 const FORSAKEN: Duration = Duration::from_secs(3);
 
 /// The clients of one broker.
@@ -61,8 +63,9 @@ impl Silent {
         forsaken
     }
 
-    /// The server answers no client. What the others wait meanwhile says nothing about them: one that was not answered just before
-    /// would else be given up right after, with all that it holds.
+    /// The server answers no client. What the others wait meanwhile says nothing about them: one
+    /// that was not answered just before would else be given up right after, with all that it
+    /// holds.
     fn nobody_is_answered(&mut self) {
         self.since.retain(|client, _| *client == Client::Directory);
         // They are looked at as soon as the server answers again.
@@ -71,10 +74,8 @@ impl Silent {
 
     /// Looks whether the clients that read and write get answers, which the server has just given.
     fn look(&mut self, inner: &Inner) {
-        let any = self
-            .since
-            .keys()
-            .any(|client| !matches!(client, Client::Directory | Client::Admin));
+        let any =
+            self.since.keys().any(|client| !matches!(client, Client::Directory | Client::Admin));
         if !any && self.looked.is_some_and(|at| at.elapsed() < LOOK) {
             return;
         }
@@ -118,7 +119,8 @@ pub(super) fn run(inner: &Inner) {
 
 /// Asks once and acts on the answer. Returns whether nothing is missing.
 fn round(inner: &Inner, turn: usize, silent: &mut Silent) -> bool {
-    // The creator of topics needs to know all, for those that are missing; a service only whether there is an answer.
+    // The creator of topics needs to know all, for those that are missing; a service only whether
+    // there is an answer.
     let one = inner.creator().is_none().then_some(&*inner.probe);
     let listed = inner.directory.list(one, ANSWER);
     let answered = listed.as_ref().is_ok_and(|listing| listing.brokers > 0);
@@ -158,7 +160,8 @@ fn round(inner: &Inner, turn: usize, silent: &mut Silent) -> bool {
     }
     note_topics(inner, &listing);
     if !inner.was_up.load(Ordering::Acquire) {
-        // A partition that had no leader for a moment may have been given up by the client: all are asked for again.
+        // A partition that had no leader for a moment may have been given up by the client: all are
+        // asked for again.
         for consumer in inner.consumers() {
             consumer.look_again();
         }
@@ -168,7 +171,8 @@ fn round(inner: &Inner, turn: usize, silent: &mut Silent) -> bool {
     for consumer in inner.consumers() {
         keep_reading(inner, &consumer, &listing, turn);
     }
-    inner.topics.absent(1).is_empty() && !inner.consumers().iter().any(|consumer| consumer.awaits_any())
+    inner.topics.absent(1).is_empty()
+        && !inner.consumers().iter().any(|consumer| consumer.awaits_any())
 }
 
 fn lost(inner: &Inner, reason: &str) -> bool {
@@ -184,10 +188,7 @@ fn found(inner: &Inner, brokers: usize) {
     {
         let _ = inner.cluster.set(id);
     }
-    let cluster = inner
-        .cluster
-        .get()
-        .map_or_else(String::new, |id| format!("cluster {id}, "));
+    let cluster = inner.cluster.get().map_or_else(String::new, |id| format!("cluster {id}, "));
     let plural = if brokers == 1 { "" } else { "s" };
     inner.shared.last_error.take();
     inner.shared.gate.set_up(true);
@@ -200,7 +201,8 @@ fn note_topics(inner: &Inner, listing: &Listing) {
     let found = if all {
         listing.topics.clone()
     } else {
-        let ask = |name: &Arc<str>| inner.directory.list(Some(name), ANSWER).unwrap_or_default().topics;
+        let ask =
+            |name: &Arc<str>| inner.directory.list(Some(name), ANSWER).unwrap_or_default().topics;
         inner.topics.absent(PER_ROUND).iter().flat_map(ask).collect()
     };
     learn_limits(inner, &found);
@@ -239,7 +241,8 @@ fn keep_reading(inner: &Inner, consumer: &Consumer, listing: &Listing, turn: usi
     let lost_position = consumer.take_lost_position();
     let (awaited, read): (Vec<_>, Vec<_>) = topics.into_iter().partition(|known| known.is_awaited);
     let (is_creator, waiting, count) = (inner.creator().is_some(), awaited.len(), read.len());
-    // A creator's listing holds all that there is; a service asks for some of what it waits for, in turn.
+    // A creator's listing holds all that there is; a service asks for some of what it waits for, in
+    // turn.
     let awaited = awaited.into_iter().enumerate().filter(|(number, known)| {
         known.is_idle
             && if is_creator {
@@ -269,7 +272,8 @@ fn keep_reading(inner: &Inner, consumer: &Consumer, listing: &Listing, turn: usi
                     consumer.look_again();
                 }
                 if matches!(error, LookupError::Away(_)) && Instant::now() >= deadline {
-                    // It would be so with the others: the next question is whether the server is there at all.
+                    // It would be so with the others: the next question is whether the server is
+                    // there at all.
                     return;
                 }
             }

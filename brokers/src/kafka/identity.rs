@@ -9,17 +9,18 @@ use blaze_domain::WriterId;
 use parking_lot::Mutex;
 use sha2::{Digest as _, Sha256};
 
-/// Topics whose identities are known at most; above, all are forgotten and learnt again as they are asked for.
+/// Topics whose identities are known at most; above, all are forgotten and learnt again as they are
+/// asked for.
 const MAX_KNOWN: usize = 65_536;
 
-/// The identity that the server gives a topic when it is made: a topic made anew has another one. In Kafka's own text
-/// form, 22 characters of URL-safe base64.
+/// The identity that the server gives a topic when it is made: a topic made anew has another one.
+/// In Kafka's own text form, 22 characters of URL-safe base64.
 #[derive(Clone, PartialEq, Eq, Hash)]
 pub(super) struct TopicUuid(Arc<str>);
 
 impl TopicUuid {
-    /// From ordinary base64 of 16 bytes, with or without padding; `None` for anything else and for the zero identity,
-    /// which old servers give to all topics.
+    /// From ordinary base64 of 16 bytes, with or without padding; `None` for anything else and for
+    /// the zero identity, which old servers give to all topics.
     pub(super) fn from_base64(text: &str) -> Option<Self> {
         let text = text.trim_end_matches('=').replace('+', "-").replace('/', "_");
         let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
@@ -50,9 +51,10 @@ impl fmt::Debug for TopicUuid {
 
 /// What one client of librdkafka knows of the identities of its topics.
 ///
-/// librdkafka keeps the identity to itself, but for one line of its debug log, `Topic T changed id from A to B`, which it
-/// writes whenever it learns one, before it hands out a record read under it. That line comes through the same queue as
-/// the records, so what it says holds for those behind it; and it needs no connection beside that of the client.
+/// librdkafka keeps the identity to itself, but for one line of its debug log, `Topic T changed id
+/// from A to B`, which it writes whenever it learns one, before it hands out a record read under
+/// it. That line comes through the same queue as the records, so what it says holds for those
+/// behind it; and it needs no connection beside that of the client.
 #[derive(Debug, Default)]
 pub(super) struct Identities {
     known: Mutex<HashMap<String, TopicUuid>>,
@@ -101,12 +103,15 @@ mod tests {
     fn identities_come_from_the_log() {
         let identities = Identities::default();
         identities.read_log(
-            "[thrd:main]: Topic fog.imu.data changed id from AAAAAAAAAAAAAAAAAAAAAA to a+b/cdefghijklmnopqrst",
+            "[thrd:main]: Topic fog.imu.data changed id from AAAAAAAAAAAAAAAAAAAAAA to \
+             a+b/cdefghijklmnopqrst",
         );
         let uuid = identities.of("fog.imu.data").unwrap();
         assert_eq!(uuid.as_str(), "a-b_cdefghijklmnopqrst");
         assert_eq!(identities.changes(), 1);
-        identities.read_log("[thrd:main]: Topic fog.imu.data changed id from AAAA to a+b/cdefghijklmnopqrst");
+        identities.read_log(
+            "[thrd:main]: Topic fog.imu.data changed id from AAAA to a+b/cdefghijklmnopqrst",
+        );
         assert_eq!(identities.changes(), 1, "the same again is no change");
         for line in [
             "Topic t changed id from x to AAAAAAAAAAAAAAAAAAAAAA",

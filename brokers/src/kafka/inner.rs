@@ -27,7 +27,9 @@ use super::settings::{Lot, Settings};
 use super::topic_creator::TopicCreator;
 use super::topics::Topics;
 use super::waker::ThreadWaker;
-use crate::port::{Begin, BrokerError, Health, Received, StatusCell, SubscribeOptions, Subscription, subscription};
+use crate::port::{
+    Begin, BrokerError, Health, Received, StatusCell, SubscribeOptions, Subscription, subscription,
+};
 
 /// Channels that one client reads at most, and a worker makes.
 pub(super) const MAX_CHANNELS: usize = 10_000;
@@ -111,7 +113,8 @@ impl Inner {
         if let Some(admin) = &*admin {
             return Ok(Arc::clone(admin));
         }
-        let made = Admin::new(&self.shared.settings, &self.shared.last_error).map_err(|error| error.to_string())?;
+        let made = Admin::new(&self.shared.settings, &self.shared.last_error)
+            .map_err(|error| error.to_string())?;
         Ok(Arc::clone(admin.insert(Arc::new(made))))
     }
 
@@ -150,7 +153,8 @@ impl Inner {
         if let Some(consumer) = clients.consumers.get(&large) {
             return Ok(Arc::clone(consumer));
         }
-        let consumer = Consumer::start(large, &self.layer, &self.shared).map_err(BrokerError::Away)?;
+        let consumer =
+            Consumer::start(large, &self.layer, &self.shared).map_err(BrokerError::Away)?;
         clients.consumers.insert(large, Arc::clone(&consumer));
         Ok(consumer)
     }
@@ -178,7 +182,9 @@ impl Inner {
             (true, None) => (Health::Up, detail),
             (true, Some(whom)) => (Health::InUse, format!("scope_in_use: {whom}")),
             // Down is what was up before.
-            (false, _) if self.status.borrow().health == Health::Connecting => (Health::Connecting, detail),
+            (false, _) if self.status.borrow().health == Health::Connecting => {
+                (Health::Connecting, detail)
+            }
             (false, _) => (Health::Down, detail),
         };
         self.status.set(health, &detail);
@@ -195,7 +201,8 @@ impl Inner {
                 producer.clear();
             }
         }
-        // Only this change shows at once; that the scope is ours again shows with the server's next answer.
+        // Only this change shows at once; that the scope is ours again shows with the server's next
+        // answer.
         let status = self.status.borrow().clone();
         if back && matches!(status.health, Health::Up | Health::InUse) {
             self.set_server(true, status.detail);
@@ -227,9 +234,7 @@ impl Inner {
             Ok(info) => info,
             Err(LookupError::Missing(_)) => {
                 let (sender, subscription) = subscription(options);
-                consumer
-                    .add_awaiting(&source, sender)
-                    .map_err(|error| refused(&error))?;
+                consumer.add_awaiting(&source, sender).map_err(|error| refused(&error))?;
                 self.waker.wake();
                 return Ok(subscription.starting_at(vec![0]));
             }
@@ -251,18 +256,15 @@ impl Inner {
         }
         let mut reader = ReaderToEnd::open(&self.shared, &source.topic, &marks)?;
         loop {
-            let starts = reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
-                let key = message.key()?;
-                // On channels of BlazeAIoT's own, whatever has a key is the last word about it.
-                let is_kept = channel.is_reserved() || record::is_kept(key);
-                is_kept.then(|| receive(channel, message, payload, None, &self.shared.clock))
-            })?;
+            let starts =
+                reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
+                    let key = message.key()?;
+                    // On channels of BlazeAIoT's own, whatever has a key is the last word about it.
+                    let is_kept = channel.is_reserved() || record::is_kept(key);
+                    is_kept.then(|| receive(channel, message, payload, None, &self.shared.clock))
+                })?;
             let mut kept = || -> Vec<Received> {
-                reader
-                    .take_latest()
-                    .into_iter()
-                    .map(|(_, message)| as_kept(message))
-                    .collect()
+                reader.take_latest().into_iter().map(|(_, message)| as_kept(message)).collect()
             };
             let join = Join::AfterKept(&mut kept);
             match consumer.add(&source, &info, starts.clone(), sender.clone(), join) {
@@ -274,8 +276,9 @@ impl Inner {
         }
     }
 
-    /// Where a topic begins and ends. If that does not hold where a reader is to begin, it is asked again for a while: a server that
-    /// stood still for a moment names other ends first, and a reader that believed them would leave out records.
+    /// Where a topic begins and ends. If that does not hold where a reader is to begin, it is asked
+    /// again for a while: a server that stood still for a moment names other ends first, and a
+    /// reader that believed them would leave out records.
     fn marks(
         &self,
         topic: &str,
@@ -287,7 +290,9 @@ impl Inner {
         loop {
             let marks = self.directory.marks(topic, partitions, deadline)?;
             let holds = match begin {
-                Begin::At(offsets) => marks.iter().zip(&**offsets).all(|(mark, offset)| mark.holds(*offset)),
+                Begin::At(offsets) => {
+                    marks.iter().zip(&**offsets).all(|(mark, offset)| mark.holds(*offset))
+                }
                 Begin::Now | Begin::Since { .. } => true,
             };
             if holds || doubts == 0 || self.is_closed() {
@@ -308,9 +313,7 @@ impl Inner {
                 let ends = marks.iter().map(|mark| mark.high);
                 let bound = |at: usize| latest.get(at).copied().unwrap_or(i64::MAX);
                 let first = found.into_iter().zip(ends).enumerate();
-                first
-                    .map(|(at, (found, end))| Some(found.unwrap_or(end).min(bound(at))))
-                    .collect()
+                first.map(|(at, (found, end))| Some(found.unwrap_or(end).min(bound(at)))).collect()
             }
         };
         let start = |(mark, wanted): (&Marks, Option<i64>)| match wanted {
@@ -326,7 +329,9 @@ impl Inner {
             Health::Closed => Err(BrokerError::Closed),
             Health::Up => Ok(()),
             Health::InUse if source.stays_open => Ok(()),
-            Health::InUse | Health::Connecting | Health::Down => Err(BrokerError::Away(status.detail)),
+            Health::InUse | Health::Connecting | Health::Down => {
+                Err(BrokerError::Away(status.detail))
+            }
         }
     }
 

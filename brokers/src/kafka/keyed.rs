@@ -1,5 +1,6 @@
-//! Values of keys in compacted topics: leases, and what is taken away of writers that have gone. Only the last value of a
-//! key counts, so one that the server did not take is simply written again.
+//! Values of keys in compacted topics: leases, and what is taken away of writers that have gone.
+//! Only the last value of a key counts, so one that the server did not take is simply written
+//! again.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -39,13 +40,16 @@ pub(super) struct KeyedWriter {
 }
 
 impl KeyedWriter {
-    /// Writes a value when the server can be reached; an older one of the key that still waits is forgotten.
-    pub(super) fn put(&self, topic: &Arc<Topic>, partition: Option<i32>, key: String, value: Option<Bytes>) {
-        let entry = Entry {
-            topic: Arc::clone(topic),
-            partition,
-            value,
-        };
+    /// Writes a value when the server can be reached; an older one of the key that still waits is
+    /// forgotten.
+    pub(super) fn put(
+        &self,
+        topic: &Arc<Topic>,
+        partition: Option<i32>,
+        key: String,
+        value: Option<Bytes>,
+    ) {
+        let entry = Entry { topic: Arc::clone(topic), partition, value };
         self.waiting.lock().put((Arc::clone(&topic.name), key), entry);
         self.filled.notify_one();
     }
@@ -87,7 +91,13 @@ impl KeyedWriter {
             let mut answers = Vec::with_capacity(batch.len());
             for (key, entry) in batch {
                 let (done, answer) = oneshot::channel();
-                producer.send_keyed(&entry.topic, entry.partition, &key.1, entry.value.as_ref(), done);
+                producer.send_keyed(
+                    &entry.topic,
+                    entry.partition,
+                    &key.1,
+                    entry.value.as_ref(),
+                    done,
+                );
                 answers.push((key, entry, answer));
             }
             let mut refused = Vec::new();

@@ -5,10 +5,11 @@
 //!                  Directory: metadata, offsets ◄── health thread: answers, topics, positions ──► status
 //! ```
 //!
-//! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). Clients
-//! that read channels use no consumer group: each reads all partitions at positions of its own. The lease of workers is one
-//! (module `group_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations
-//! by its worker (module `worker_side`); messages that a service publishes before that wait.
+//! A channel is a topic; a message is a record whose headers are the message's header, as text
+//! (module `record`). Clients that read channels use no consumer group: each reads all partitions
+//! at positions of its own. The lease of workers is one (module `group_lease`). Topics are made by
+//! the flow of the layer alone (module `flow_side`), and those of configurations by its worker
+//! (module `worker_side`); messages that a service publishes before that wait.
 
 mod admin;
 mod clock;
@@ -49,8 +50,8 @@ use tokio::sync::watch;
 use crate::open::OpenError;
 use crate::outbox::{Admission, LanePublisher};
 use crate::port::{
-    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Publisher, PublisherOptions, Role,
-    StatusCell, SubscribeOptions, Subscription,
+    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Publisher,
+    PublisherOptions, Role, StatusCell, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
 pub use group_lease::{GroupLease, GroupLeaseOptions};
@@ -67,7 +68,8 @@ use worker_side::KafkaWorkerSide;
 
 /// How long closing waits for what was taken while the server is known not to answer.
 const DRAIN: Duration = Duration::from_secs(1);
-/// How long while it answers: a leader that is elected, or a busy server, may take more than a second for its acknowledgement.
+/// How long while it answers: a leader that is elected, or a busy server, may take more than a
+/// second for its acknowledgement.
 const DRAIN_ANSWERED: Duration = Duration::from_secs(3);
 /// How long closing waits for threads and tasks beyond that.
 const END: Duration = Duration::from_secs(3);
@@ -91,15 +93,13 @@ impl KafkaBroker {
     /// Begins to connect, in the background. Must be called on a Tokio runtime.
     ///
     /// # Errors
-    /// [`OpenError`] for a property that the client library refuses or that may not be set, and for TLS where it is not
-    /// built in.
+    /// [`OpenError`] for a property that the client library refuses or that may not be set, and for
+    /// TLS where it is not built in.
     pub fn open(section: &Section, role: &Role) -> Result<Self, OpenError> {
         let (settings, names) = read(section)?;
         let shared = Shared::new(settings);
-        let refused = |reason: String| OpenError::Setting {
-            key: "kafka.properties".to_owned(),
-            reason,
-        };
+        let refused =
+            |reason: String| OpenError::Setting { key: "kafka.properties".to_owned(), reason };
         let directory = Directory::new(&shared).map_err(|error| refused(error.to_string()))?;
         let topics = Topics::default();
         let (layer, flow, worker) = match role {
@@ -141,7 +141,8 @@ impl KafkaBroker {
         supervisor
             .spawn_thread("kafka-health", TaskPolicy::MayEnd, move || health::run(&watched))
             .map_err(|error| error.to_string())?;
-        // A new producer needs up to a second for its number: what is surely used gets it beforehand.
+        // A new producer needs up to a second for its number: what is surely used gets it
+        // beforehand.
         let small = |reliable| {
             let lot = Lot { reliable, large: false };
             inner.producer(lot).map_err(|error| error.to_string())
@@ -169,10 +170,8 @@ impl Drop for KafkaBroker {
 
 fn read(section: &Section) -> Result<(Settings, Names), OpenError> {
     let settings = Settings::new(section)?;
-    let names = Names::new(&section.prefix).map_err(|reason| OpenError::Setting {
-        key: "kafka.prefix".to_owned(),
-        reason,
-    })?;
+    let names = Names::new(&section.prefix)
+        .map_err(|reason| OpenError::Setting { key: "kafka.prefix".to_owned(), reason })?;
     Ok((settings, names))
 }
 
@@ -186,13 +185,14 @@ impl Broker for KafkaBroker {
         self.inner.status.subscribe()
     }
 
-    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError> {
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError> {
         let inner = &self.inner;
         let name = inner.names.topic(channel)?;
-        let producer = inner.producer(Lot {
-            reliable: options.reliable,
-            large: options.large,
-        })?;
+        let producer = inner.producer(Lot { reliable: options.reliable, large: options.large })?;
         let (topic, new) = inner.topics.of(&name, names::stays_open(channel));
         if new {
             inner.waker.wake();
@@ -202,17 +202,16 @@ impl Broker for KafkaBroker {
         } else {
             Keying::Writer { depth: options.depth }
         };
-        let admission = TopicAdmission {
-            shared: Arc::clone(&inner.shared),
-            stays_open: topic.stays_open,
-        };
-        Ok(Arc::new(LanePublisher {
-            lane: producer.lane(Target { topic, keying }),
-            admission,
-        }))
+        let admission =
+            TopicAdmission { shared: Arc::clone(&inner.shared), stays_open: topic.stays_open };
+        Ok(Arc::new(LanePublisher { lane: producer.lane(Target { topic, keying }), admission }))
     }
 
-    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
         self.subscribe_from(channel, options, Begin::Now).await
     }
 
@@ -223,24 +222,19 @@ impl Broker for KafkaBroker {
         begin: Begin,
     ) -> Result<Subscription, BrokerError> {
         let (inner, channel) = (Arc::clone(&self.inner), channel.clone());
-        let subscribe = tokio::task::spawn_blocking(move || inner.subscribe(&channel, options, &begin));
+        let subscribe =
+            tokio::task::spawn_blocking(move || inner.subscribe(&channel, options, &begin));
         subscribe.await.unwrap_or_else(|_| Err(BrokerError::Closed))
     }
 
     fn flow_side(&self) -> Option<Arc<dyn FlowSide>> {
         let state = Arc::clone(self.inner.flow.as_ref()?);
-        Some(Arc::new(KafkaFlowSide {
-            inner: Arc::clone(&self.inner),
-            state,
-        }))
+        Some(Arc::new(KafkaFlowSide { inner: Arc::clone(&self.inner), state }))
     }
 
     fn worker_side(&self) -> Option<Arc<dyn WorkerSide>> {
         let creator = Arc::clone(self.inner.worker.as_ref()?);
-        Some(Arc::new(KafkaWorkerSide {
-            inner: Arc::clone(&self.inner),
-            creator,
-        }))
+        Some(Arc::new(KafkaWorkerSide { inner: Arc::clone(&self.inner), creator }))
     }
 
     async fn close(&self) {

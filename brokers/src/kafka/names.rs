@@ -10,16 +10,13 @@ use crate::port::BrokerError;
 const MAX_TOPIC_BYTES: usize = 249;
 
 /// Channels that a flow makes before it says that it is up, beside its leases.
-pub(super) const RESERVED: [&str; 4] = [
-    "blaze/flow/control",
-    "blaze/flow/events",
-    "blaze/flow/peers",
-    "blaze/reply",
-];
+pub(super) const RESERVED: [&str; 4] =
+    ["blaze/flow/control", "blaze/flow/events", "blaze/flow/peers", "blaze/reply"];
 
-/// Channels that a worker of BlazeConfig makes before it says that it is up. `blaze/reply` is a flow's as well: the first
-/// makes it, and both make the same.
-pub(super) const OF_WORKER: [&str; 4] = ["blaze/config/get", "blaze/config/ack", "blaze/watchdog", "blaze/reply"];
+/// Channels that a worker of BlazeConfig makes before it says that it is up. `blaze/reply` is a
+/// flow's as well: the first makes it, and both make the same.
+pub(super) const OF_WORKER: [&str; 4] =
+    ["blaze/config/get", "blaze/config/ack", "blaze/watchdog", "blaze/reply"];
 
 /// Where flows keep leases: a topic that is no channel.
 const LEASES: &str = "blaze.flow.leases";
@@ -44,21 +41,17 @@ impl Names {
         let prefix = prefix.replace('/', ".");
         match prefix.chars().find(|c| !is_legal(*c)) {
             None => Ok(Self { prefix }),
-            Some(found) => Err(format!(
-                "holds {found:?}, and Kafka's topics have only A-Z a-z 0-9 . _ -"
-            )),
+            Some(found) => {
+                Err(format!("holds {found:?}, and Kafka's topics have only A-Z a-z 0-9 . _ -"))
+            }
         }
     }
 
     /// The topic of a channel.
     pub(super) fn topic(&self, channel: &ChannelName) -> Result<Arc<str>, BrokerError> {
         let topic = format!("{}{}", self.prefix, channel.as_str().replace('/', "."));
-        let refuse = |reason: String| {
-            Err(BrokerError::Name {
-                channel: channel.to_string(),
-                reason,
-            })
-        };
+        let refuse =
+            |reason: String| Err(BrokerError::Name { channel: channel.to_string(), reason });
         if topic.len() > MAX_TOPIC_BYTES {
             return refuse(format!(
                 "its Kafka topic would have {} bytes, at most {MAX_TOPIC_BYTES} are possible",
@@ -104,10 +97,7 @@ mod tests {
     #[test]
     fn channels_become_topics() {
         assert_eq!(topic("", "imu/data").unwrap(), "imu.data");
-        assert_eq!(
-            topic("edge-1.", "blaze/flow/control").unwrap(),
-            "edge-1.blaze.flow.control"
-        );
+        assert_eq!(topic("edge-1.", "blaze/flow/control").unwrap(), "edge-1.blaze.flow.control");
         assert_eq!(topic("fog/", "a").unwrap(), "fog.a");
         assert_eq!(&*Names::new("x.").unwrap().leases(), "x.blaze.flow.leases");
     }
@@ -117,10 +107,7 @@ mod tests {
         assert!(Names::new("a:").is_err());
         let longest = "t".repeat(200);
         assert!(topic(&"p".repeat(49), &longest).is_ok());
-        assert!(matches!(
-            topic(&"p".repeat(50), &longest),
-            Err(BrokerError::Name { .. })
-        ));
+        assert!(matches!(topic(&"p".repeat(50), &longest), Err(BrokerError::Name { .. })));
     }
 
     #[test]

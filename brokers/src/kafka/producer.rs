@@ -1,4 +1,5 @@
-//! Writing: what publishers hand over waits in an outbox, of which little at a time is with librdkafka.
+//! Writing: what publishers hand over waits in an outbox, of which little at a time is with
+//! librdkafka.
 //!
 //! ```text
 //! publish ─► outbox (bounds, deadlines) ─► feeder task ─► librdkafka (≤ 1 MiB not acknowledged) ─► server
@@ -6,7 +7,8 @@
 //!                                             └── room ── delivery callback (poll thread): settles, measures the clock
 //! ```
 //!
-//! Little is with librdkafka because from there nothing can be taken back: it has no deadline of a message's own.
+//! Little is with librdkafka because from there nothing can be taken back: it has no deadline of a
+//! message's own.
 
 mod delivery;
 mod ready;
@@ -38,12 +40,13 @@ pub(super) use ready::{Keying, Target};
 const WINDOW: usize = 1024 * 1024;
 /// Messages that are handed over at once.
 const BATCH: usize = 1024;
-/// With so many bytes in flight, what comes waits until less are. librdkafka sends what it has as soon as it looks, but of one
-/// partition no more while five messages are not acknowledged, and until then it looks without a pause: what it has not it
-/// need not look for, and goes in one request.
+/// With so many bytes in flight, what comes waits until less are. librdkafka sends what it has as
+/// soon as it looks, but of one partition no more while five messages are not acknowledged, and
+/// until then it looks without a pause: what it has not it need not look for, and goes in one
+/// request.
 const CROWD: usize = 64 * 1024;
-/// How long the poll thread is with the client while something is in flight: closing waits for that. The client library
-/// ends each such visit with up to a millisecond of busy waiting.
+/// How long the poll thread is with the client while something is in flight: closing waits for
+/// that. The client library ends each such visit with up to a millisecond of busy waiting.
 const POLL: Duration = Duration::from_millis(200);
 /// How often the poll thread looks for errors while nothing is.
 const IDLE: Duration = Duration::from_millis(500);
@@ -111,8 +114,9 @@ impl Producer {
         &self.context.shared
     }
 
-    /// Lets the client connect and get its number from the server. By itself it tries so twice a second, and each try asks
-    /// a connection at random, whether that is up or not; but also with each answer that it gets.
+    /// Lets the client connect and get its number from the server. By itself it tries so twice a
+    /// second, and each try asks a connection at random, whether that is up or not; but also with
+    /// each answer that it gets.
     fn warm_up(&self) {
         let Some(client) = self.client.lock().clone() else {
             return;
@@ -131,11 +135,7 @@ impl Producer {
 
     fn make_client(&self) -> Result<Arc<Client>, KafkaError> {
         let context = SharedContext(Arc::clone(&self.context));
-        self.shared()
-            .settings
-            .producer(self.lot)
-            .create_with_context(context)
-            .map(Arc::new)
+        self.shared().settings.producer(self.lot).create_with_context(context).map(Arc::new)
     }
 
     /// Whether the client gets an answer of the server. Waits for it.
@@ -144,7 +144,8 @@ impl Producer {
         client.is_none_or(|client| client.client().fetch_metadata(Some(topic), timeout).is_ok())
     }
 
-    /// Lets the poll thread begin anew with a client that knows nothing. What the old one holds is dropped and counted.
+    /// Lets the poll thread begin anew with a client that knows nothing. What the old one holds is
+    /// dropped and counted.
     pub(super) fn remake(&self) {
         self.context.fatal.store(true, Ordering::Release);
         self.context.waker.wake();
@@ -176,7 +177,8 @@ impl Producer {
         self.context.waker.wake();
     }
 
-    /// Whether everything that was taken has been settled. Looked for in the order in which messages go.
+    /// Whether everything that was taken has been settled. Looked for in the order in which
+    /// messages go.
     pub(super) fn is_drained(&self) -> bool {
         self.outbox.is_empty()
             && !self.handing_over.load(Ordering::Acquire)
@@ -205,7 +207,8 @@ impl Producer {
 
     /// Hands over as much as there is room for.
     fn hand_over(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
-        // Before anything leaves the outbox, so that nothing is overlooked that is not in flight yet.
+        // Before anything leaves the outbox, so that nothing is overlooked that is not in flight
+        // yet.
         self.handing_over.store(true, Ordering::Release);
         self.hand_over_what_fits(taken, scratch);
         self.handing_over.store(false, Ordering::Release);
@@ -220,11 +223,13 @@ impl Producer {
             let Some(client) = self.client.lock().clone() else {
                 return;
             };
-            // Topics with small batches have one turn in each take: what of them is handed over goes together.
+            // Topics with small batches have one turn in each take: what of them is handed over
+            // goes together.
             let mut limited: Vec<Arc<str>> = Vec::new();
             let allowance = |to: &Target| {
                 let topic = &to.topic;
-                let open = topic.partitions().is_some() && self.shared().gate.lets(topic.stays_open);
+                let open =
+                    topic.partitions().is_some() && self.shared().gate.lets(topic.stays_open);
                 let allowed = topic.allowance().filter(|_| open)?;
                 if allowed != usize::MAX {
                     if limited.contains(&topic.name) {
@@ -235,16 +240,17 @@ impl Producer {
                 Some(allowed)
             };
             let room = WINDOW - in_flight;
-            self.outbox
-                .take_ready(Instant::now(), BATCH, room, in_flight == 0, allowance, taken);
+            self.outbox.take_ready(Instant::now(), BATCH, room, in_flight == 0, allowance, taken);
             if taken.is_empty() {
                 return;
             }
             // All at once, as librdkafka begins to send what it has with the first.
-            let ready: Vec<Ready> = taken.drain(..).map(|waiting| Ready::new(waiting, scratch)).collect();
+            let ready: Vec<Ready> =
+                taken.drain(..).map(|waiting| Ready::new(waiting, scratch)).collect();
             for ready in ready {
                 let topic = Arc::clone(&ready.delivery.topic);
-                let mut record = BaseRecord::with_opaque_to(&topic.name, ready.delivery).payload(&ready.payload[..]);
+                let mut record = BaseRecord::with_opaque_to(&topic.name, ready.delivery)
+                    .payload(&ready.payload[..]);
                 record.key = ready.key.as_deref();
                 record.partition = ready.partition;
                 record.headers = ready.headers;
@@ -305,7 +311,11 @@ impl Producer {
                     || "it gets no answer".to_owned(),
                     |(code, text)| format!("{code}: {text}"),
                 );
-                tracing::warn!(producer = self.lot.as_str(), reason, "the Kafka producer is made anew");
+                tracing::warn!(
+                    producer = self.lot.as_str(),
+                    reason,
+                    "the Kafka producer is made anew"
+                );
             }
             self.context.fatal.store(false, Ordering::Release);
             // What the old client held fails as it is dropped, and is not sent again.

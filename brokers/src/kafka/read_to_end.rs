@@ -34,7 +34,8 @@ impl<T> ReaderToEnd<T> {
     /// Begins at the beginning of each partition.
     pub(super) fn open(shared: &Shared, topic: &str, marks: &[Marks]) -> Result<Self, LookupError> {
         let context = ReadContext::new(&Arc::default(), &shared.last_error);
-        let client: BaseConsumer<ReadContext> = shared.settings.reader_to_end().create_with_context(context)?;
+        let client: BaseConsumer<ReadContext> =
+            shared.settings.reader_to_end().create_with_context(context)?;
         let mut list = TopicPartitionList::new();
         for (partition, mark) in (0..).zip(marks) {
             list.add_partition_offset(topic, partition, Offset::Offset(mark.low))?;
@@ -49,9 +50,9 @@ impl<T> ReaderToEnd<T> {
         })
     }
 
-    /// Reads until every partition has been read to its end and at least to the given offset; returns where it stands.
-    /// `make` turns a record with its payload into what is kept; `None` leaves it out. A record without a payload takes its
-    /// key away.
+    /// Reads until every partition has been read to its end and at least to the given offset;
+    /// returns where it stands. `make` turns a record with its payload into what is kept; `None`
+    /// leaves it out. A record without a payload takes its key away.
     pub(super) fn read(
         &mut self,
         least: &[i64],
@@ -77,7 +78,8 @@ impl<T> ReaderToEnd<T> {
                 Some(Ok(message)) => {
                     if let Some(at) = index(message.partition(), &self.positions) {
                         self.positions[at] = message.offset() + 1;
-                        self.ended[at] |= least.get(at).is_some_and(|least| self.positions[at] >= *least);
+                        self.ended[at] |=
+                            least.get(at).is_some_and(|least| self.positions[at] >= *least);
                     }
                     self.latest.apply(&message, &mut make);
                 }
@@ -88,7 +90,9 @@ impl<T> ReaderToEnd<T> {
                     }
                 }
                 // The client tries again by itself; what lasts ends at the deadline.
-                Some(Err(error)) => tracing::debug!(topic = self.topic, %error, "reading to the end"),
+                Some(Err(error)) => {
+                    tracing::debug!(topic = self.topic, %error, "reading to the end")
+                }
             }
         }
         for (position, least) in self.positions.iter_mut().zip(least) {
@@ -131,11 +135,7 @@ struct Latest<T> {
 
 impl<T> Default for Latest<T> {
     fn default() -> Self {
-        Self {
-            by_key: HashMap::new(),
-            bytes: 0,
-            left_out: 0,
-        }
+        Self { by_key: HashMap::new(), bytes: 0, left_out: 0 }
     }
 }
 
@@ -162,11 +162,7 @@ impl<T> Latest<T> {
         self.bytes += bytes;
         self.by_key.insert(
             key.to_vec(),
-            Kept {
-                value,
-                place: (message.partition(), message.offset()),
-                bytes,
-            },
+            Kept { value, place: (message.partition(), message.offset()), bytes },
         );
     }
 }

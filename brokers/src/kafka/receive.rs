@@ -39,13 +39,7 @@ pub(super) fn receive(
     } else {
         content_of(channel, message, payload, identity)
     };
-    Received {
-        content,
-        at,
-        broker_age_us,
-        kept: false,
-        place,
-    }
+    Received { content, at, broker_age_us, kept: false, place }
 }
 
 fn content_of(
@@ -66,10 +60,7 @@ fn content_of(
     };
     // The client library panics over a header's name that is not UTF-8.
     catch_unwind(AssertUnwindSafe(read)).unwrap_or(Content::Malformed {
-        error: FrameError::Field {
-            field: "headers",
-            reason: "have a name that is not UTF-8",
-        },
+        error: FrameError::Field { field: "headers", reason: "have a name that is not UTF-8" },
         bytes,
     })
 }

@@ -26,10 +26,9 @@ pub(super) fn read<'a>(
 ) -> Content {
     let bytes = payload.len();
     match read_header(channel, headers) {
-        Ok(None) if bytes > MAX_PAYLOAD_BYTES => Content::Malformed {
-            error: FrameError::PayloadTooLarge(bytes),
-            bytes,
-        },
+        Ok(None) if bytes > MAX_PAYLOAD_BYTES => {
+            Content::Malformed { error: FrameError::PayloadTooLarge(bytes), bytes }
+        }
         Ok(None) => Content::Bare { payload, identity },
         Ok(Some(header)) => match Frame::new(&header, payload) {
             Ok(frame) => Content::Frame(frame),
@@ -102,12 +101,7 @@ fn read_field(header: &mut Header, name: &str, value: Option<&[u8]>) -> Result<(
 
 fn read_origin(origin: &mut Origin, text: &str) -> Result<(), FrameError> {
     let mut parts = text.split('/');
-    for slot in [
-        &mut origin.layer,
-        &mut origin.node,
-        &mut origin.service,
-        &mut origin.instance,
-    ] {
+    for slot in [&mut origin.layer, &mut origin.node, &mut origin.service, &mut origin.instance] {
         let Some(part) = parts.next() else {
             return field("blaze-origin", "has not three slashes");
         };
@@ -151,10 +145,7 @@ pub(super) fn write(frame: &Frame, scratch: &mut String, mut add: impl FnMut(&'s
     let origin = frame.origin();
     put(
         "blaze-origin",
-        format_args!(
-            "{}/{}/{}/{}",
-            origin.layer, origin.node, origin.service, origin.instance
-        ),
+        format_args!("{}/{}/{}/{}", origin.layer, origin.node, origin.service, origin.instance),
     );
     put("blaze-epoch", format_args!("{}", origin.epoch));
     put("blaze-writer", format_args!("{}", frame.writer()));
@@ -187,23 +178,17 @@ pub(super) fn write(frame: &Frame, scratch: &mut String, mut add: impl FnMut(&'s
 pub(super) fn headers(frame: &Frame, scratch: &mut String) -> OwnedHeaders {
     let mut headers = Some(OwnedHeaders::new_with_capacity(14));
     write(frame, scratch, |key, value| {
-        headers = headers.take().map(|headers| {
-            headers.insert(rdkafka::message::Header {
-                key,
-                value: Some(value),
-            })
-        });
+        headers = headers
+            .take()
+            .map(|headers| headers.insert(rdkafka::message::Header { key, value: Some(value) }));
     });
     headers.unwrap_or_default()
 }
 
-/// The key of a record: those of one writer stay in order, and a compacted topic keeps the last `depth` of each.
+/// The key of a record: those of one writer stay in order, and a compacted topic keeps the last
+/// `depth` of each.
 pub(super) fn key(writer: WriterId, sequence: u64, depth: u32) -> String {
-    if depth == 0 {
-        writer.to_string()
-    } else {
-        kept_key(writer, sequence % u64::from(depth))
-    }
+    if depth == 0 { writer.to_string() } else { kept_key(writer, sequence % u64::from(depth)) }
 }
 
 /// The key of one of a writer's places in a compacted topic.
@@ -211,12 +196,14 @@ pub(super) fn kept_key(writer: WriterId, slot: u64) -> String {
     format!("{writer}/{slot}")
 }
 
-/// Whether a record of this key is kept for late joiners: all but the volatile ones that are written here.
+/// Whether a record of this key is kept for late joiners: all but the volatile ones that are
+/// written here.
 pub(super) fn is_kept(key: &[u8]) -> bool {
     !(key.len() == 32 && key.iter().all(u8::is_ascii_hexdigit))
 }
 
-/// The partition of a writer, for topics that keep: there a writer's records have several keys, and must stay in order.
+/// The partition of a writer, for topics that keep: there a writer's records have several keys, and
+/// must stay in order.
 pub(super) fn partition_of(writer: WriterId, partitions: i32) -> i32 {
     let [a, b, c, d, ..] = writer.0;
     let spread = u32::from_be_bytes([a, b, c, d]) % u32::try_from(partitions.max(1)).unwrap_or(1);

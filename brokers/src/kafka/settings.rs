@@ -12,7 +12,8 @@ use crate::open::OpenError;
 const MESSAGE_MAX_BYTES: &str = "17825792";
 /// Most that one fetch brings together, beside that one record.
 const FETCH_MAX_BYTES: &str = "18874368";
-/// How long the server may keep a fetch that has nothing to give, in milliseconds. A partition that joins waits for that.
+/// How long the server may keep a fetch that has nothing to give, in milliseconds. A partition that
+/// joins waits for that.
 const FETCH_WAIT_MS: &str = "50";
 /// Identities of topics come with this part of the debug log.
 const DEBUG: &str = "topic";
@@ -68,11 +69,7 @@ pub(super) struct Lot {
 impl Lot {
     /// How long a message may wait for the server.
     pub(super) fn longest_wait(self) -> Duration {
-        if self.reliable {
-            Duration::from_secs(120)
-        } else {
-            Duration::from_secs(5)
-        }
+        if self.reliable { Duration::from_secs(120) } else { Duration::from_secs(5) }
     }
 
     /// For names of tasks and threads.
@@ -117,13 +114,7 @@ impl Settings {
         let settings = Self { base, given };
         // One of each kind, as each has its own rules for what goes together.
         settings.check(&settings.consumer(false), "consumers")?;
-        settings.check(
-            &settings.producer(Lot {
-                reliable: true,
-                large: false,
-            }),
-            "producers",
-        )?;
+        settings.check(&settings.producer(Lot { reliable: true, large: false }), "producers")?;
         Ok(settings)
     }
 
@@ -135,10 +126,7 @@ impl Settings {
                 // The library's text may hold the value.
                 format!("the client library refuses them for {kind}")
             };
-            OpenError::Setting {
-                key: "kafka.properties".to_owned(),
-                reason,
-            }
+            OpenError::Setting { key: "kafka.properties".to_owned(), reason }
         };
         config.create_native_config().map(|_| ()).map_err(refused)
     }
@@ -182,7 +170,8 @@ impl Settings {
                 ("allow.auto.create.topics", "false"),
                 ("fetch.message.max.bytes", MESSAGE_MAX_BYTES),
                 ("fetch.max.bytes", FETCH_MAX_BYTES),
-                // A position that the server has not is looked into: it must never mean "all again".
+                // A position that the server has not is looked into: it must never mean "all
+                // again".
                 ("auto.offset.reset", "error"),
                 ("debug", DEBUG),
             ],
@@ -242,8 +231,8 @@ impl Settings {
         self.with(
             &[
                 ("linger.ms", "0"),
-                // The server's limit counts the whole batch, and a topic allows 1 MiB by default: messages that each fit must
-                // not be refused for their company.
+                // The server's limit counts the whole batch, and a topic allows 1 MiB by default:
+                // messages that each fit must not be refused for their company.
                 ("batch.size", "500000"),
                 ("queue.buffering.max.kbytes", "65536"),
             ],
@@ -267,7 +256,10 @@ fn check_property(key: &str, value: &str) -> Result<(), OpenError> {
     if FIXED.contains(&key) {
         return refuse("is set by BlazeAIoT itself");
     }
-    if key == "security.protocol" && !cfg!(feature = "kafka-tls") && !value.eq_ignore_ascii_case("plaintext") {
+    if key == "security.protocol"
+        && !cfg!(feature = "kafka-tls")
+        && !value.eq_ignore_ascii_case("plaintext")
+    {
         return Err(OpenError::NotBuilt { feature: "kafka-tls" });
     }
     let mut alone = ClientConfig::new();
@@ -337,32 +329,24 @@ pub(super) mod tests {
             config.create_native_config().unwrap();
         }
         for (reliable, large) in [(false, false), (true, false), (false, true), (true, true)] {
-            settings
-                .producer(Lot { reliable, large })
-                .create_native_config()
-                .unwrap();
+            settings.producer(Lot { reliable, large }).create_native_config().unwrap();
         }
     }
 
     #[test]
     fn properties_of_the_section_count_but_not_against_correctness() {
         let settings = Settings::new(&section(r#"{"linger.ms": 3, "client.id": "me"}"#)).unwrap();
-        let config = settings.producer(Lot {
-            reliable: false,
-            large: false,
-        });
+        let config = settings.producer(Lot { reliable: false, large: false });
         assert_eq!(config.get("linger.ms"), Some("3"));
         assert_eq!(config.get("client.id"), Some("me"));
         assert_eq!(config.get("message.timeout.ms"), Some("5000"));
-        for key in [
-            "enable.idempotence",
-            "acks",
-            "group.id",
-            "enable.auto.commit",
-            "auto.offset.reset",
-        ] {
+        for key in
+            ["enable.idempotence", "acks", "group.id", "enable.auto.commit", "auto.offset.reset"]
+        {
             match refused(&format!(r#"{{"{key}": "x"}}"#)) {
-                OpenError::Setting { key: found, .. } => assert_eq!(found, format!("kafka.properties.{key}")),
+                OpenError::Setting { key: found, .. } => {
+                    assert_eq!(found, format!("kafka.properties.{key}"))
+                }
                 other => panic!("{other}"),
             }
         }

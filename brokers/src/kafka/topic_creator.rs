@@ -1,5 +1,5 @@
-//! Creates the topics that are to be there, and creates them again when they vanish: those that this program itself needs,
-//! and those that were prepared for others.
+//! Creates the topics that are to be there, and creates them again when they vanish: those that
+//! this program itself needs, and those that were prepared for others.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -20,11 +20,13 @@ use crate::port::BrokerError;
 const TRY_AGAIN: Duration = Duration::from_secs(10);
 /// The same where it could not make it just then.
 const TRY_SOON: Duration = Duration::from_secs(1);
-/// Topics that are asked for in one request: the server makes one after the other, and has a second and a half for all.
+/// Topics that are asked for in one request: the server makes one after the other, and has a second
+/// and a half for all.
 const AT_ONCE: usize = 100;
 
-/// Whether a server that refuses to make a topic would refuse it again, for what it is or for who asks. All else passes: too few
-/// brokers for as many replicas as it gives, a controller that changes, no answer in time.
+/// Whether a server that refuses to make a topic would refuse it again, for what it is or for who
+/// asks. All else passes: too few brokers for as many replicas as it gives, a controller that
+/// changes, no answer in time.
 pub(super) fn is_final(code: RDKafkaErrorCode) -> bool {
     matches!(
         code,
@@ -87,21 +89,25 @@ impl TopicCreator {
     /// `needed`: topics that this program itself cannot do without.
     pub(super) fn new(needed: impl Iterator<Item = (Arc<str>, Purpose)>) -> Self {
         let prepared = needed.map(|(name, purpose)| (name, Prepared::new(None, purpose)));
-        Self(Mutex::new(State {
-            prepared: prepared.collect(),
-            ..State::default()
-        }))
+        Self(Mutex::new(State { prepared: prepared.collect(), ..State::default() }))
     }
 
-    /// Creates what is missing. Fails where a topic that this program itself needs could not be created; a topic of a service
-    /// that cannot be created holds up no other, and is tried again after a while.
+    /// Creates what is missing. Fails where a topic that this program itself needs could not be
+    /// created; a topic of a service that cannot be created holds up no other, and is tried again
+    /// after a while.
     pub(super) fn create(&self, inner: &Inner, listing: &Listing) -> Result<Created, String> {
         let (missing, created) = self.0.lock().missing(listing);
         if !missing.is_empty() {
             match inner.admin()?.make(&missing) {
                 Ok(refused) => self.0.lock().note_refused(&missing, &refused)?,
                 Err(error) if created.needed => return Err(error.to_string()),
-                Err(error) => tracing::warn!(%error, topics = missing.len(), "topics could not be made, trying on"),
+                Err(error) => {
+                    tracing::warn!(
+                        %error,
+                        topics = missing.len(),
+                        "topics could not be made, trying on",
+                    )
+                }
             }
         }
         if !created.needed {
@@ -113,17 +119,13 @@ impl TopicCreator {
     /// Topics that were there before, for something else, shall keep the last values of their keys.
     fn keep_last_values(&self, inner: &Inner) {
         let is_there = |prepared: &Prepared| {
-            prepared
-                .topic
-                .as_ref()
-                .is_some_and(|topic| topic.partitions().is_some())
+            prepared.topic.as_ref().is_some_and(|topic| topic.partitions().is_some())
         };
         let to_check: Vec<Arc<str>> = {
             let state = self.0.lock();
-            let open = state
-                .prepared
-                .iter()
-                .filter(|(_, prepared)| prepared.purpose.keeps() && !prepared.keeps && is_there(prepared));
+            let open = state.prepared.iter().filter(|(_, prepared)| {
+                prepared.purpose.keeps() && !prepared.keeps && is_there(prepared)
+            });
             open.map(|(name, _)| Arc::clone(name)).take(AT_ONCE).collect()
         };
         for name in to_check {
@@ -136,7 +138,13 @@ impl TopicCreator {
                         prepared.keeps = true;
                     }
                 }
-                Err(error) => tracing::debug!(topic = %name, error, "could not be made to keep the last values"),
+                Err(error) => {
+                    tracing::debug!(
+                        topic = %name,
+                        error,
+                        "could not be made to keep the last values",
+                    )
+                }
             }
         }
     }
@@ -153,10 +161,8 @@ impl TopicCreator {
         let mut state = self.0.lock();
         let State { prepared, listed, .. } = &mut *state;
         if !prepared.contains_key(&name) {
-            let named = prepared
-                .keys()
-                .map(|name| &**name)
-                .chain(listed.keys().map(String::as_str));
+            let named =
+                prepared.keys().map(|name| &**name).chain(listed.keys().map(String::as_str));
             if let Some(other) = named.into_iter().find(|other| collide(&name, other)) {
                 return Err(BrokerError::Collision {
                     channel: channel.to_string(),
@@ -167,9 +173,7 @@ impl TopicCreator {
         let entry = prepared
             .entry(Arc::clone(&name))
             .or_insert_with(|| Prepared::new(Some(channel.clone()), purpose));
-        entry
-            .topic
-            .get_or_insert_with(|| inner.topics.of(&name, names::stays_open(channel)).0);
+        entry.topic.get_or_insert_with(|| inner.topics.of(&name, names::stays_open(channel)).0);
         if purpose.keeps() && !entry.purpose.keeps() {
             (entry.purpose, entry.keeps) = (purpose, false);
         }
@@ -206,15 +210,7 @@ impl TopicCreator {
 
 impl Prepared {
     fn new(channel: Option<ChannelName>, purpose: Purpose) -> Self {
-        Self {
-            channel,
-            topic: None,
-            purpose,
-            depth: 0,
-            keeps: false,
-            refused: None,
-            asked: false,
-        }
+        Self { channel, topic: None, purpose, depth: 0, keeps: false, refused: None, asked: false }
     }
 
     /// Why the server refused to create the topic when it was last asked.
@@ -241,10 +237,7 @@ impl State {
         self.listed.clone_from(&listing.topics);
         self.refuse_collisions();
         let mut missing = Vec::new();
-        let mut created = Created {
-            needed: false,
-            anew: false,
-        };
+        let mut created = Created { needed: false, anew: false };
         let listed = &self.listed;
         // What this program itself needs comes first.
         let (needed, others): (Vec<_>, Vec<_>) =
@@ -264,11 +257,7 @@ impl State {
 
     /// What was prepared before its name was known to be taken is no longer created.
     fn refuse_collisions(&mut self) {
-        let Self {
-            prepared,
-            listed,
-            collisions,
-        } = self;
+        let Self { prepared, listed, collisions } = self;
         prepared.retain(|name, prepared| {
             let Some(channel) = &prepared.channel else { return true };
             if listed.contains_key(&**name) {
@@ -277,7 +266,11 @@ impl State {
             let Some(other) = listed.keys().find(|other| collide(name, other)) else {
                 return true;
             };
-            tracing::warn!(topic = %name, other, "their names are one to Kafka: the topic is not made");
+            tracing::warn!(
+                topic = %name,
+                other,
+                "their names are one to Kafka: the topic is not made",
+            );
             collisions.push((channel.clone(), other.clone()));
             false
         });
@@ -293,10 +286,7 @@ impl State {
             let Some(prepared) = self.prepared.get_mut(name) else {
                 continue;
             };
-            let code = refused
-                .iter()
-                .find(|(refused, _)| refused == name)
-                .map(|(_, code)| *code);
+            let code = refused.iter().find(|(refused, _)| refused == name).map(|(_, code)| *code);
             if let Some(code) = code.filter(|code| prepared.refusal() != Some(*code)) {
                 tracing::warn!(topic = %name, %code, "the topic could not be made");
             }

@@ -6,7 +6,8 @@ use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
 
-/// Bytes of a batch that no batch of ours reaches: twice `batch.size`, for what a record has beside its payload.
+/// Bytes of a batch that no batch of ours reaches: twice `batch.size`, for what a record has beside
+/// its payload.
 const ROOMY: usize = 1_000_000;
 /// Not known to exist.
 const ABSENT: i32 = 0;
@@ -28,7 +29,8 @@ pub(super) struct Topic {
 }
 
 impl Topic {
-    /// How many partitions the server has of it; `None` = it is not known to be there, so that nothing is handed over.
+    /// How many partitions the server has of it; `None` = it is not known to be there, so that
+    /// nothing is handed over.
     pub(super) fn partitions(&self) -> Option<i32> {
         let partitions = self.partitions.load(Ordering::Acquire);
         (partitions != ABSENT).then_some(partitions)
@@ -36,8 +38,9 @@ impl Topic {
 
     /// Bytes that may be handed over now, by the sizes that an outbox counts; `None` = nothing.
     ///
-    /// The server's limit counts the whole batch that the client library makes of what it has. Where that could be too large,
-    /// only what fits is handed over, and more when it is acknowledged: a message is refused for its own size alone.
+    /// The server's limit counts the whole batch that the client library makes of what it has.
+    /// Where that could be too large, only what fits is handed over, and more when it is
+    /// acknowledged: a message is refused for its own size alone.
     pub(super) fn allowance(&self) -> Option<usize> {
         if !self.is_limited() {
             return Some(usize::MAX);
@@ -62,8 +65,8 @@ impl Topic {
         }
     }
 
-    /// The server refused a message for its size. Where that was thought to be impossible, messages go one by one until the
-    /// server has told its limit.
+    /// The server refused a message for its size. Where that was thought to be impossible, messages
+    /// go one by one until the server has told its limit.
     pub(super) fn doubt_limit(&self) {
         if !self.is_limited() {
             self.largest_batch.store(1, Ordering::Release);
@@ -116,12 +119,10 @@ impl Topics {
     /// Up to `limit` topics that are not known to be there, in turns.
     pub(super) fn absent(&self, limit: usize) -> Vec<Arc<str>> {
         let by_name = self.by_name.lock();
-        let absent = |topic: &Weak<Topic>| topic.upgrade().filter(|topic| topic.partitions().is_none());
-        let mut names: Vec<Arc<str>> = by_name
-            .values()
-            .filter_map(absent)
-            .map(|topic| Arc::clone(&topic.name))
-            .collect();
+        let absent =
+            |topic: &Weak<Topic>| topic.upgrade().filter(|topic| topic.partitions().is_none());
+        let mut names: Vec<Arc<str>> =
+            by_name.values().filter_map(absent).map(|topic| Arc::clone(&topic.name)).collect();
         if names.len() > limit {
             names.sort_unstable();
             let from = self.next.fetch_add(limit, Ordering::Relaxed) % names.len();
@@ -131,8 +132,13 @@ impl Topics {
         names
     }
 
-    /// Up to `limit` topics whose largest batch the server is to be asked for, of those that it has.
-    pub(super) fn without_limit(&self, found: &HashMap<String, usize>, limit: usize) -> Vec<Arc<str>> {
+    /// Up to `limit` topics whose largest batch the server is to be asked for, of those that it
+    /// has.
+    pub(super) fn without_limit(
+        &self,
+        found: &HashMap<String, usize>,
+        limit: usize,
+    ) -> Vec<Arc<str>> {
         let unknown = |topic: &Arc<Topic>| {
             let is_there = topic.partitions().is_some() || found.contains_key(&*topic.name);
             topic.asks_limit.load(Ordering::Acquire) && is_there
@@ -152,7 +158,8 @@ impl Topics {
         }
     }
 
-    /// The server has these topics, with so many partitions; and no others, if these are `all`. Returns whether one came.
+    /// The server has these topics, with so many partitions; and no others, if these are `all`.
+    /// Returns whether one came.
     pub(super) fn note(&self, found: &HashMap<String, usize>, all: bool) -> bool {
         let mut came = false;
         for (name, topic) in &*self.by_name.lock() {
@@ -175,10 +182,7 @@ mod tests {
     use super::*;
 
     fn found(topics: &[(&str, usize)]) -> HashMap<String, usize> {
-        topics
-            .iter()
-            .map(|(name, partitions)| ((*name).to_owned(), *partitions))
-            .collect()
+        topics.iter().map(|(name, partitions)| ((*name).to_owned(), *partitions)).collect()
     }
 
     #[test]
@@ -233,7 +237,8 @@ mod tests {
     #[test]
     fn absent_topics_have_their_turns() {
         let topics = Topics::default();
-        let names: Vec<Arc<str>> = (0..40).map(|number| Arc::from(format!("t{number:02}"))).collect();
+        let names: Vec<Arc<str>> =
+            (0..40).map(|number| Arc::from(format!("t{number:02}"))).collect();
         let kept: Vec<_> = names.iter().map(|name| topics.of(name, false).0).collect();
         let mut seen: Vec<_> = (0..3).flat_map(|_| topics.absent(16)).collect();
         seen.sort_unstable();

@@ -1,8 +1,9 @@
-//! What a worker of BlazeConfig does on its Kafka, beside messages: topics, and notices that stay in them, one per key.
+//! What a worker of BlazeConfig does on its Kafka, beside messages: topics, and notices that stay
+//! in them, one per key.
 //!
-//! A notice is a record with a key, whose value is the payload as it is; a record without a value takes it away. It counts as
-//! written when the server has acknowledged it. What it has not within some seconds is given up, so that the newest takes its
-//! place.
+//! A notice is a record with a key, whose value is the payload as it is; a record without a value
+//! takes it away. It counts as written when the server has acknowledged it. What it has not within
+//! some seconds is given up, so that the newest takes its place.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -46,10 +47,7 @@ impl KafkaWorkerSide {
             }))
         };
         let wait = |reason: String| {
-            Err(WriteError::NotYet {
-                channels: BTreeSet::from([message.channel.clone()]),
-                reason,
-            })
+            Err(WriteError::NotYet { channels: BTreeSet::from([message.channel.clone()]), reason })
         };
         let known = self
             .creator
@@ -57,12 +55,16 @@ impl KafkaWorkerSide {
         match known.flatten() {
             Some((topic, _)) if topic.partitions().is_some() => Ok(Some(topic)),
             Some((_, refusal)) => match refusal {
-                Some(code) if is_final(code) => refuse(format!("the server does not make its topic {name}: {code}")),
+                Some(code) if is_final(code) => {
+                    refuse(format!("the server does not make its topic {name}: {code}"))
+                }
                 Some(code) => wait(format!("the server cannot make its topic {name} now: {code}")),
                 None => wait(format!("topic {name} is being made")),
             },
             None if message.value.is_none() => Ok(None),
-            None => refuse("it was not prepared, or its topic has the name of another one".to_owned()),
+            None => {
+                refuse("it was not prepared, or its topic has the name of another one".to_owned())
+            }
         }
     }
 
@@ -76,10 +78,7 @@ fn bytes_of(message: &KeyedMessage) -> usize {
 }
 
 fn too_large(message: &KeyedMessage) -> WriteError {
-    WriteError::TooLarge {
-        channel: message.channel.clone(),
-        bytes: bytes_of(message),
-    }
+    WriteError::TooLarge { channel: message.channel.clone(), bytes: bytes_of(message) }
 }
 
 #[async_trait]
@@ -122,10 +121,7 @@ impl WorkerSide for KafkaWorkerSide {
             }
         }
         if !missing.is_empty() {
-            return Err(WriteError::NotYet {
-                channels: missing,
-                reason: waits_for,
-            });
+            return Err(WriteError::NotYet { channels: missing, reason: waits_for });
         }
         let mut answers = Vec::with_capacity(ready.len());
         for (message, topic) in ready {
@@ -138,9 +134,11 @@ impl WorkerSide for KafkaWorkerSide {
             let error = match answer.await {
                 Ok(Fate::Delivered) => continue,
                 Ok(Fate::Dropped(DropReason::TooLarge)) => too_large(message),
-                Ok(Fate::Dropped(_)) | Err(_) => {
-                    BrokerError::Away(format!("{}: the server did not acknowledge it", message.channel)).into()
-                }
+                Ok(Fate::Dropped(_)) | Err(_) => BrokerError::Away(format!(
+                    "{}: the server did not acknowledge it",
+                    message.channel
+                ))
+                .into(),
             };
             written = written.and(Err(error));
         }

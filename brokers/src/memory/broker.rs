@@ -14,8 +14,8 @@ use tokio::sync::watch;
 
 use super::{Channel, MemoryHub};
 use crate::port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Content, Health, Later, PublishOutcome, Publisher, PublisherOptions,
-    StatusCell, SubscribeOptions, Subscription, SubscriptionSender,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Content, Health, Later, PublishOutcome,
+    Publisher, PublisherOptions, StatusCell, SubscribeOptions, Subscription, SubscriptionSender,
 };
 
 /// A client of a [`MemoryHub`]; made by [`MemoryHub::broker`].
@@ -50,7 +50,8 @@ impl Client {
         self.closed.load(Ordering::Acquire)
     }
 
-    /// Takes note of a subscription, to close it. Returns false when the client was closed meanwhile.
+    /// Takes note of a subscription, to close it. Returns false when the client was closed
+    /// meanwhile.
     fn note(&self, sender: SubscriptionSender) -> bool {
         let mut subscriptions = self.subscriptions.lock();
         if self.is_closed() {
@@ -98,7 +99,11 @@ impl Broker for MemoryBroker {
         self.client.status.subscribe()
     }
 
-    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError> {
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError> {
         if self.client.is_closed() {
             return Err(BrokerError::Closed);
         }
@@ -110,7 +115,11 @@ impl Broker for MemoryBroker {
         }))
     }
 
-    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
         if self.client.is_closed() {
             return Err(BrokerError::Closed);
         }
@@ -118,11 +127,7 @@ impl Broker for MemoryBroker {
             return Err(BrokerError::Away(self.hub.health().1));
         }
         let (sender, subscription) = self.hub.subscribe(channel, options)?;
-        if self.client.note(sender) {
-            Ok(subscription)
-        } else {
-            Err(BrokerError::Closed)
-        }
+        if self.client.note(sender) { Ok(subscription) } else { Err(BrokerError::Closed) }
     }
 
     async fn close(&self) {
@@ -155,12 +160,12 @@ impl Publisher for MemoryPublisher {
         if let Some(refusal) = self.refusal(frame.payload()) {
             return refusal;
         }
-        self.hub
-            .deliver(&self.channel, Content::Frame(frame.clone()), self.depth);
+        self.hub.deliver(&self.channel, Content::Frame(frame.clone()), self.depth);
         PublishOutcome::Taken
     }
 
-    /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept for late joiners.
+    /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept
+    /// for late joiners.
     fn publish_bare(&self, payload: &Bytes, _deadline: Option<Instant>) -> PublishOutcome {
         if let Some(refusal) = self.refusal(payload) {
             return refusal;

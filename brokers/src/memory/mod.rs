@@ -7,9 +7,10 @@
 //!                                           └─► retained: last `depth` frames per (channel, writer)
 //! ```
 //!
-//! A [`MemoryHub`] is the server, a [`MemoryBroker`] one client of it; a client also sees what it publishes itself, as on
-//! Redis. Messages are shared, never copied. [`MemoryHub::cut`] and [`MemoryHub::restore`] take the server away and bring
-//! it back, so that what follows an outage can be tried without a server.
+//! A [`MemoryHub`] is the server, a [`MemoryBroker`] one client of it; a client also sees what it
+//! publishes itself, as on Redis. Messages are shared, never copied. [`MemoryHub::cut`] and
+//! [`MemoryHub::restore`] take the server away and bring it back, so that what follows an outage
+//! can be tried without a server.
 
 mod broker;
 
@@ -26,22 +27,23 @@ use parking_lot::Mutex;
 
 pub use broker::MemoryBroker;
 
-use crate::port::{BrokerError, Content, Health, Received, SubscribeOptions, Subscription, SubscriptionSender};
+use crate::port::{
+    BrokerError, Content, Health, Received, SubscribeOptions, Subscription, SubscriptionSender,
+};
 use crate::retained::{RetainedBounds, RetainedCache};
 use broker::Client;
 
 /// Channels that one hub holds at most.
 pub const MAX_CHANNELS: usize = 65_536;
 /// What one hub retains: 65,536 pairs of channel and writer, 64 MiB.
-const RETAINED: RetainedBounds = RetainedBounds {
-    writers: 65_536,
-    bytes: 64 * 1024 * 1024,
-    bytes_of_writer: 64 * 1024 * 1024,
-};
-/// Allowance for what a retained message takes beside its bytes: index entries and the parsed header.
+const RETAINED: RetainedBounds =
+    RetainedBounds { writers: 65_536, bytes: 64 * 1024 * 1024, bytes_of_writer: 64 * 1024 * 1024 };
+/// Allowance for what a retained message takes beside its bytes: index entries and the parsed
+/// header.
 const OVERHEAD_BYTES: usize = 512;
 
-/// A named space of channels: the server of the memory broker. Cheap to clone; all clones are the same hub.
+/// A named space of channels: the server of the memory broker. Cheap to clone; all clones are the
+/// same hub.
 #[derive(Clone)]
 pub struct MemoryHub {
     shared: Arc<Shared>,
@@ -75,8 +77,8 @@ struct Channels {
 
 const FIRST_SWEEP: usize = 64;
 
-/// Who reads a channel. Its lock is held while a message is handed out and kept, so that a late joiner gets each message
-/// either from what is kept or as it is published, and never both.
+/// Who reads a channel. Its lock is held while a message is handed out and kept, so that a late
+/// joiner gets each message either from what is kept or as it is published, and never both.
 struct Channel {
     name: ChannelName,
     readers: Mutex<Vec<SubscriptionSender>>,
@@ -90,10 +92,7 @@ impl MemoryHub {
             shared: Arc::new(Shared {
                 name: name.into(),
                 up: AtomicBool::new(true),
-                channels: Mutex::new(Channels {
-                    by_name: HashMap::new(),
-                    sweep_at: FIRST_SWEEP,
-                }),
+                channels: Mutex::new(Channels { by_name: HashMap::new(), sweep_at: FIRST_SWEEP }),
                 retained: Mutex::new(RetainedCache::new(RETAINED)),
                 clients: Mutex::default(),
             }),
@@ -112,12 +111,14 @@ impl MemoryHub {
         MemoryBroker::new(self.clone(), client)
     }
 
-    /// Simulates an outage: clients are [`Health::Down`], publishes are dropped, subscriptions stay and are silent.
+    /// Simulates an outage: clients are [`Health::Down`], publishes are dropped, subscriptions stay
+    /// and are silent.
     pub fn cut(&self) {
         self.set_up(false);
     }
 
-    /// Ends the outage that [`MemoryHub::cut`] began: clients are [`Health::Up`], subscriptions go on.
+    /// Ends the outage that [`MemoryHub::cut`] began: clients are [`Health::Up`], subscriptions go
+    /// on.
     pub fn restore(&self) {
         self.set_up(true);
     }
@@ -130,7 +131,8 @@ impl MemoryHub {
     /// What the hub holds now.
     #[must_use]
     pub fn stats(&self) -> MemoryHubStats {
-        let channels: Vec<Arc<Channel>> = self.shared.channels.lock().by_name.values().cloned().collect();
+        let channels: Vec<Arc<Channel>> =
+            self.shared.channels.lock().by_name.values().cloned().collect();
         let subscriptions = channels.iter().map(|channel| channel.count_readers()).sum();
         MemoryHubStats {
             channels: channels.len(),
@@ -179,10 +181,7 @@ impl MemoryHub {
         if channels.by_name.len() >= MAX_CHANNELS {
             return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
         }
-        let channel = Arc::new(Channel {
-            name: name.clone(),
-            readers: Mutex::default(),
-        });
+        let channel = Arc::new(Channel { name: name.clone(), readers: Mutex::default() });
         channels.by_name.insert(name.clone(), Arc::clone(&channel));
         Ok(channel)
     }
@@ -208,20 +207,21 @@ impl MemoryHub {
         Ok((sender, subscription))
     }
 
-    /// All that is retained of a channel, in the order of arrival. It walks all writers of the hub, 65,536 at
-    /// most: the cost of one subscription, under the mutex that publishers with `depth` take.
+    /// All that is retained of a channel, in the order of arrival. It walks all writers of the hub,
+    /// 65,536 at most: the cost of one subscription, under the mutex that publishers with `depth`
+    /// take.
     fn retained_of(&self, channel: &ChannelName) -> Vec<(Frame, Instant)> {
         let retained = self.shared.retained.lock();
         let of_channel = retained.iter().filter(|((name, _), ..)| name == channel);
-        let mut found: Vec<_> = of_channel
-            .flat_map(|(.., of_writer)| of_writer.iter().cloned())
-            .collect();
+        let mut found: Vec<_> =
+            of_channel.flat_map(|(.., of_writer)| of_writer.iter().cloned()).collect();
         // Stable, and the times of one writer ascend.
         found.sort_by_key(|(_, since)| *since);
         found
     }
 
-    /// Hands a message to all readers of a channel, and keeps the last `depth` frames of its writer.
+    /// Hands a message to all readers of a channel, and keeps the last `depth` frames of its
+    /// writer.
     fn deliver(&self, channel: &Channel, content: Content, depth: u32) {
         let mut readers = channel.readers.lock();
         // Under the lock, so that the times of one writer ascend.
@@ -230,10 +230,8 @@ impl MemoryHub {
             && let Content::Frame(frame) = &message.content
         {
             let writer = (channel.name.clone(), frame.writer());
-            let (size, depth) = (
-                frame.wire_len() + OVERHEAD_BYTES,
-                usize::try_from(depth).unwrap_or(usize::MAX),
-            );
+            let (size, depth) =
+                (frame.wire_len() + OVERHEAD_BYTES, usize::try_from(depth).unwrap_or(usize::MAX));
             let mut retained = self.shared.retained.lock();
             retained.keep(writer, (frame.clone(), message.at), size, depth);
         }
@@ -260,8 +258,9 @@ impl Channel {
 }
 
 impl Channels {
-    /// Forgets channels that nobody reads and no publisher holds. Retained messages are found by name, not through the
-    /// channel. The bound doubles, so that sweeping costs a constant per channel made.
+    /// Forgets channels that nobody reads and no publisher holds. Retained messages are found by
+    /// name, not through the channel. The bound doubles, so that sweeping costs a constant per
+    /// channel made.
     fn sweep(&mut self) {
         self.by_name
             .retain(|_, channel| Arc::strong_count(channel) > 1 || channel.count_readers() > 0);

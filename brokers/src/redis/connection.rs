@@ -1,10 +1,12 @@
-//! Keeps one connection: connects, lets it be served, watches it, and connects again when it is lost.
+//! Keeps one connection: connects, lets it be served, watches it, and connects again when it is
+//! lost.
 //!
 //! The `ConnectionManager` of the library (1.8.1) is not used:
-//! - It subscribes again with one SUBSCRIBE and ignores a refusal: one channel that the access list forbids meanwhile
-//!   silently costs all others.
+//! - It subscribes again with one SUBSCRIBE and ignores a refusal: one channel that the access list
+//!   forbids meanwhile silently costs all others.
 //! - After a refused login it never connects again, even when the password is right later.
-//! - It does not tell that it is connected again, nor why it is not yet, and puts an unbounded queue before the push sender.
+//! - It does not tell that it is connected again, nor why it is not yet, and puts an unbounded
+//!   queue before the push sender.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -28,7 +30,8 @@ const HELD: Duration = Duration::from_secs(2);
 /// Pause after the first failure; each further one doubles it, and a random part is left out.
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
 const LONGEST_PAUSE: Duration = Duration::from_millis(500);
-/// Requests that wait for the library to encode them; what is under way is limited elsewhere, in bytes.
+/// Requests that wait for the library to encode them; what is under way is limited elsewhere, in
+/// bytes.
 const LIBRARY_QUEUE: usize = 256;
 
 /// A connection that stands.
@@ -40,7 +43,9 @@ pub(super) struct Session {
 impl From<RedisError> for Failure {
     fn from(error: RedisError) -> Self {
         Self {
-            is_refusal: !(error.is_timeout() || error.is_io_error() || error.is_connection_dropped()),
+            is_refusal: !(error.is_timeout()
+                || error.is_io_error()
+                || error.is_connection_dropped()),
             why: if error.is_timeout() {
                 "no answer in time".to_owned()
             } else {
@@ -50,7 +55,8 @@ impl From<RedisError> for Failure {
     }
 }
 
-/// Takes what the server sends unasked. Runs inside the task that reads the socket, so it never waits.
+/// Takes what the server sends unasked. Runs inside the task that reads the socket, so it never
+/// waits.
 struct Pushes {
     state: Arc<State>,
     subscriptions: Option<Arc<Subscriptions>>,
@@ -72,8 +78,11 @@ impl Pushes {
     fn message(&self, data: Vec<Value>) {
         self.liveness.received();
         let mut data = data.into_iter();
-        if let (Some(subscriptions), Some(Value::BulkString(channel)), Some(Value::BulkString(payload))) =
-            (&self.subscriptions, data.next(), data.next())
+        if let (
+            Some(subscriptions),
+            Some(Value::BulkString(channel)),
+            Some(Value::BulkString(payload)),
+        ) = (&self.subscriptions, data.next(), data.next())
             && self.state.delivers()
         {
             subscriptions.deliver(&channel, payload, Instant::now());
@@ -135,7 +144,8 @@ async fn connect(shared: &Shared, line: Line) -> RedisResult<Session> {
         subscriptions: shared.subscriptions_of(line).cloned(),
         liveness: Arc::clone(&liveness),
     };
-    // An answer may come late, and then counts: there is no time-out after which something would be sent again.
+    // An answer may come late, and then counts: there is no time-out after which something would be
+    // sent again.
     let config = AsyncConnectionConfig::new()
         .set_connection_timeout(Some(CONNECT))
         .set_response_timeout(None)
@@ -146,7 +156,8 @@ async fn connect(shared: &Shared, line: Line) -> RedisResult<Session> {
     Ok(Session { connection, liveness })
 }
 
-/// Pings a server that is quiet, and tells when it falls silent and when it answers again. Returns when a ping fails.
+/// Pings a server that is quiet, and tells when it falls silent and when it answers again. Returns
+/// when a ping fails.
 async fn watch(shared: &Shared, line: Line, session: &Session) -> Failure {
     let mut watch = Watch::new(line.is_large());
     let mut looks = tokio::time::interval(LOOK);
@@ -162,7 +173,8 @@ async fn watch(shared: &Shared, line: Line, session: &Session) -> Failure {
             _ = looks.tick() => match watch.look(&session.liveness) {
                 Look::Alive => shared.set_silent(line, false),
                 Look::Silent => shared.set_silent(line, true),
-                Look::Ping if answer.is_terminated() => answer.set(ping(session.connection.clone()).fuse()),
+                Look::Ping if answer.is_terminated() =>
+                    answer.set(ping(session.connection.clone()).fuse()),
                 Look::Ping | Look::Unknown => {}
             },
         }
@@ -180,7 +192,8 @@ fn report(shared: &Shared, line: Line, failure: &Failure) {
         tracing::warn!(
             connection = line.name(),
             why,
-            "a reading connection to redis was lost: what is published until it is back is missing; where the server \
+            "a reading connection to redis was lost: what is published until it is back is \
+             missing; where the server \
              stays up and this repeats, raise its client-output-buffer-limit for pubsub"
         );
     } else {

@@ -1,4 +1,5 @@
-//! What only the flow of a scope does on its Redis: leases, and the end of what is kept of a writer.
+//! What only the flow of a scope does on its Redis: leases, and the end of what is kept of a
+//! writer.
 
 use std::sync::Arc;
 

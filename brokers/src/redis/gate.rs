@@ -66,7 +66,8 @@ impl Gate {
         }
     }
 
-    /// Announces a batch before its messages leave the queue, so that [`Gate::drained`] never overlooks them.
+    /// Announces a batch before its messages leave the queue, so that [`Gate::drained`] never
+    /// overlooks them.
     pub(super) fn busy(self: &Arc<Self>) -> Busy {
         self.busy.fetch_add(1, Ordering::SeqCst);
         Busy(Arc::clone(self))
@@ -76,7 +77,9 @@ impl Gate {
     pub(super) async fn drained(&self, most: Duration) {
         self.outbox.close();
         let empty = async {
-            while self.is_open() && !(self.outbox.is_empty() && self.busy.load(Ordering::SeqCst) == 0) {
+            while self.is_open()
+                && !(self.outbox.is_empty() && self.busy.load(Ordering::SeqCst) == 0)
+            {
                 self.settled.notified().await;
             }
         };

@@ -1,4 +1,5 @@
-//! What is kept for late joiners: the list that a field of a hash holds, and the own copy that it is written from.
+//! What is kept for late joiners: the list that a field of a hash holds, and the own copy that it
+//! is written from.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Weak};
@@ -14,11 +15,8 @@ use super::state::Line;
 use crate::retained::{Retained, RetainedBounds, RetainedCache};
 
 /// What one client keeps. Each message writes the whole field.
-const BOUNDS: RetainedBounds = RetainedBounds {
-    writers: 65_536,
-    bytes: 64 * 1024 * 1024,
-    bytes_of_writer: 32 * 1024 * 1024,
-};
+const BOUNDS: RetainedBounds =
+    RetainedBounds { writers: 65_536, bytes: 64 * 1024 * 1024, bytes_of_writer: 32 * 1024 * 1024 };
 /// Length and time before each frame.
 const ENTRY_HEAD_BYTES: usize = 12;
 /// Allowance for what a frame takes beside its bytes.
@@ -45,8 +43,8 @@ impl KeptFrame {
 
 /// The value of a field: the frames of one writer, oldest first.
 ///
-/// Each is a length (u32, little-endian), the time of publishing (u64, little-endian, nanoseconds since 1970, the clock of
-/// the host of the publisher) and the frame.
+/// Each is a length (u32, little-endian), the time of publishing (u64, little-endian, nanoseconds
+/// since 1970, the clock of the host of the publisher) and the frame.
 pub(super) struct Field<'a>(&'a Retained<KeptFrame>);
 
 impl Field<'_> {
@@ -108,16 +106,19 @@ pub(super) struct Mirror {
 
 impl Default for Mirror {
     fn default() -> Self {
-        Self {
-            fields: RetainedCache::new(BOUNDS),
-            rewrite: HashMap::new(),
-        }
+        Self { fields: RetainedCache::new(BOUNDS), rewrite: HashMap::new() }
     }
 }
 
 impl Mirror {
-    /// Takes a frame in as the newest of its writer, and gives the field that is to be written before it is published.
-    pub(super) fn keep(&mut self, key: &FieldKey, frame: KeptFrame, depth: usize) -> Option<Field<'_>> {
+    /// Takes a frame in as the newest of its writer, and gives the field that is to be written
+    /// before it is published.
+    pub(super) fn keep(
+        &mut self,
+        key: &FieldKey,
+        frame: KeptFrame,
+        depth: usize,
+    ) -> Option<Field<'_>> {
         let size = frame.length() + ENTRY_HEAD_BYTES + OVERHEAD_BYTES;
         self.fields.keep(key.clone(), frame, size, depth);
         self.fields.get(key).map(Field)

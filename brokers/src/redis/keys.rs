@@ -1,12 +1,12 @@
-//! Keys on a Redis server: values, records with an expiry; locks are in module `lock`. What the worker of BlazeConfig and the cache of a service
-//! keep there, beside messages.
+//! Keys on a Redis server: values, records with an expiry; locks are in module `lock`. What the
+//! worker of BlazeConfig and the cache of a service keep there, beside messages.
 //!
 //! ```text
 //! apply(changes, messages) ─► MULTI … EXEC   all of it or nothing
 //! ```
 //!
-//! A connection is made when it is needed and forgotten when it fails: every call either does what it should within its time
-//! or says that it did not.
+//! A connection is made when it is needed and forgotten when it fails: every call either does what
+//! it should within its time or says that it did not.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -17,7 +17,9 @@ use blaze_domain::node_file::RedisBroker as Section;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use redis::aio::MultiplexedConnection;
-use redis::{AsyncConnectionConfig, Cmd, FromRedisValue, InfoDict, RedisError, SetExpiry, SetOptions};
+use redis::{
+    AsyncConnectionConfig, Cmd, FromRedisValue, InfoDict, RedisError, SetExpiry, SetOptions,
+};
 
 use super::lock::Scripts;
 use super::settings::Settings;
@@ -37,7 +39,8 @@ const VALUES: usize = 8;
 /// Why a call did nothing, or nobody knows whether it did.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum KeyError {
-    /// The server does not answer, or cannot do it as it is just now. What was asked for may have been done.
+    /// The server does not answer, or cannot do it as it is just now. What was asked for may have
+    /// been done.
     #[error("{place}: {reason}")]
     Away {
         /// Host and port, or path.
@@ -55,8 +58,8 @@ pub enum KeyError {
     },
 }
 
-/// What a server says that starts, has no memory left, cannot write to its disk, is a replica just now, or lets nobody in: it says
-/// so of everything, and after a while no more.
+/// What a server says that starts, has no memory left, cannot write to its disk, is a replica just
+/// now, or lets nobody in: it says so of everything, and after a while no more.
 const PASSING: [&str; 11] = [
     "LOADING",
     "OOM",
@@ -73,7 +76,11 @@ const PASSING: [&str; 11] = [
 
 /// Whether the server may do later what it does not do now.
 fn passes(error: &RedisError) -> bool {
-    if error.is_io_error() || error.is_timeout() || error.is_connection_dropped() || error.is_connection_refusal() {
+    if error.is_io_error()
+        || error.is_timeout()
+        || error.is_connection_dropped()
+        || error.is_connection_refusal()
+    {
         return true;
     }
     if matches!(error.kind(), redis::ErrorKind::AuthenticationFailed) {
@@ -157,7 +164,11 @@ impl RedisKeys {
     ///
     /// # Errors
     /// [`KeyError`].
-    pub async fn apply(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), KeyError> {
+    pub async fn apply(
+        &self,
+        changes: &[KeyChange],
+        messages: &[(ChannelName, Bytes)],
+    ) -> Result<(), KeyError> {
         if changes.is_empty() && messages.is_empty() {
             return Ok(());
         }
@@ -167,7 +178,11 @@ impl RedisKeys {
             .await
     }
 
-    pub(super) fn pipeline(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> redis::Pipeline {
+    pub(super) fn pipeline(
+        &self,
+        changes: &[KeyChange],
+        messages: &[(ChannelName, Bytes)],
+    ) -> redis::Pipeline {
         let mut pipe = redis::pipe();
         for change in changes {
             self.add(&mut pipe, change);
@@ -186,7 +201,8 @@ impl RedisKeys {
             }
             KeyChange::PutRecord { key, members, expires } => {
                 let key = self.settings.names.key(key);
-                let members: Vec<(&str, &str)> = members.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
+                let members: Vec<(&str, &str)> =
+                    members.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
                 let expires_ms = i64::try_from(expires.as_millis()).unwrap_or(i64::MAX).max(1);
                 pipe.del(&key).ignore();
                 if !members.is_empty() {
@@ -213,18 +229,27 @@ impl RedisKeys {
     ///
     /// # Errors
     /// [`KeyError`].
-    pub async fn put_for(&self, key: &str, value: &Bytes, expires: Duration) -> Result<(), KeyError> {
+    pub async fn put_for(
+        &self,
+        key: &str,
+        value: &Bytes,
+        expires: Duration,
+    ) -> Result<(), KeyError> {
         let expires_ms = u64::try_from(expires.as_millis()).unwrap_or(u64::MAX).max(1);
         let options = SetOptions::default().with_expiration(SetExpiry::PX(expires_ms));
-        self.ask(Cmd::set_options(self.settings.names.key(key), value.as_ref(), options))
-            .await
+        self.ask(Cmd::set_options(self.settings.names.key(key), value.as_ref(), options)).await
     }
 
     /// There is no such record, if one member of it has this value.
     ///
     /// # Errors
     /// [`KeyError`].
-    pub async fn delete_record(&self, key: &str, member: &str, value: &str) -> Result<(), KeyError> {
+    pub async fn delete_record(
+        &self,
+        key: &str,
+        member: &str,
+        value: &str,
+    ) -> Result<(), KeyError> {
         let mut call = self.scripts.delete_record.key(self.settings.names.key(key));
         call.arg(member).arg(value);
         self.call(|mut connection| async move { call.invoke_async::<()>(&mut connection).await })
@@ -240,21 +265,31 @@ impl RedisKeys {
         Ok((!members.is_empty()).then_some(members))
     }
 
-    /// All values whose key begins so, at most so many; keys are given without the prefix of the section.
+    /// All values whose key begins so, at most so many; keys are given without the prefix of the
+    /// section.
     ///
     /// # Errors
     /// [`KeyError`].
-    pub async fn values(&self, beginning: &str, most: usize) -> Result<Vec<(String, Bytes)>, KeyError> {
+    pub async fn values(
+        &self,
+        beginning: &str,
+        most: usize,
+    ) -> Result<Vec<(String, Bytes)>, KeyError> {
         let found = self.each::<Option<Vec<u8>>>("GET", beginning, most, VALUES).await?;
         let there = |(key, value): (String, Option<Vec<u8>>)| Some((key, Bytes::from(value?)));
         Ok(found.into_iter().filter_map(there).collect())
     }
 
-    /// All records whose key begins so, at most so many; keys are given without the prefix of the section.
+    /// All records whose key begins so, at most so many; keys are given without the prefix of the
+    /// section.
     ///
     /// # Errors
     /// [`KeyError`].
-    pub async fn records(&self, beginning: &str, most: usize) -> Result<Vec<(String, Record)>, KeyError> {
+    pub async fn records(
+        &self,
+        beginning: &str,
+        most: usize,
+    ) -> Result<Vec<(String, Record)>, KeyError> {
         let mut found = self.each::<Record>("HGETALL", beginning, most, SCAN).await?;
         found.retain(|(_, members)| !members.is_empty());
         Ok(found)
@@ -280,9 +315,7 @@ impl RedisKeys {
             let found: Vec<T> = self
                 .call(|mut connection| async move { pipe.query_async(&mut connection).await })
                 .await?;
-            let names = part
-                .iter()
-                .map(|key| key.strip_prefix(&prefix).unwrap_or(key).to_owned());
+            let names = part.iter().map(|key| key.strip_prefix(&prefix).unwrap_or(key).to_owned());
             out.extend(names.zip(found));
         }
         Ok(out)
@@ -303,8 +336,8 @@ impl RedisKeys {
         }
     }
 
-    /// Waits until the server has been started anew: then it may have lost what it had. One that does not say which start it
-    /// is (no right to `INFO`) is never found to be another.
+    /// Waits until the server has been started anew: then it may have lost what it had. One that
+    /// does not say which start it is (no right to `INFO`) is never found to be another.
     pub async fn restarted(&self) {
         loop {
             if let Ok(Some(run)) = self.run_id().await {
@@ -319,7 +352,8 @@ impl RedisKeys {
         }
     }
 
-    /// Which start of the server this is: after another one, what it had may be lost. `None`: it does not say.
+    /// Which start of the server this is: after another one, what it had may be lost. `None`: it
+    /// does not say.
     ///
     /// # Errors
     /// [`KeyError`].
@@ -329,17 +363,21 @@ impl RedisKeys {
     }
 
     async fn ask<T: FromRedisValue>(&self, command: Cmd) -> Result<T, KeyError> {
-        self.call(|mut connection| async move { command.query_async(&mut connection).await })
-            .await
+        self.call(|mut connection| async move { command.query_async(&mut connection).await }).await
     }
 
-    pub(super) async fn call<T, F>(&self, ask: impl FnOnce(MultiplexedConnection) -> F) -> Result<T, KeyError>
+    pub(super) async fn call<T, F>(
+        &self,
+        ask: impl FnOnce(MultiplexedConnection) -> F,
+    ) -> Result<T, KeyError>
     where
         F: Future<Output = Result<T, RedisError>>,
     {
         let connection = self.connection().await?;
         let answer = tokio::time::timeout(CALL, ask(connection)).await;
-        let answer = answer.unwrap_or_else(|_| Err(RedisError::from((redis::ErrorKind::Io, "no answer within 2 s"))));
+        let answer = answer.unwrap_or_else(|_| {
+            Err(RedisError::from((redis::ErrorKind::Io, "no answer within 2 s")))
+        });
         answer.map_err(|error| self.failed(&error))
     }
 
@@ -359,7 +397,8 @@ impl RedisKeys {
 
     fn failed(&self, error: &RedisError) -> KeyError {
         let (place, reason) = (self.settings.place.clone(), error.to_string());
-        // Also after a refusal: a server that became a replica, or wants another password, is another one behind the same name.
+        // Also after a refusal: a server that became a replica, or wants another password, is
+        // another one behind the same name.
         *self.connection.lock() = None;
         match passes(error) {
             true => KeyError::Away { place, reason },

@@ -1,4 +1,5 @@
-//! The flow's leases on the server: an own copy, what is still to be written, and the task that writes it.
+//! The flow's leases on the server: an own copy, what is still to be written, and the task that
+//! writes it.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -126,7 +127,10 @@ impl Ledger {
     }
 
     fn is_settled(&self) -> bool {
-        !self.under_way && !self.clear_first && self.pending.is_settled() && self.forgotten.is_empty()
+        !self.under_way
+            && !self.clear_first
+            && self.pending.is_settled()
+            && self.forgotten.is_empty()
     }
 
     fn field(&self, key: &str) -> (Arc<str>, String) {
@@ -137,7 +141,9 @@ impl Ledger {
     pub(super) fn rewrite_all(&mut self) {
         let (hash, pending) = (&self.hash, &mut self.pending);
         let mut all = self.kept.iter();
-        if !all.all(|(key, value)| pending.put((Arc::clone(hash), key.clone()), Some(value.clone()))) {
+        if !all
+            .all(|(key, value)| pending.put((Arc::clone(hash), key.clone()), Some(value.clone())))
+        {
             self.write_anew();
         }
     }
@@ -245,10 +251,7 @@ fn judge(answers: redis::RedisResult<Vec<redis::Value>>) -> Result<(), Option<St
         _ => None,
     };
     match answers {
-        Ok(answers) => answers
-            .into_iter()
-            .find_map(refusal)
-            .map_or(Ok(()), |why| Err(Some(why))),
+        Ok(answers) => answers.into_iter().find_map(refusal).map_or(Ok(()), |why| Err(Some(why))),
         Err(_) => Err(None),
     }
 }
@@ -274,7 +277,10 @@ fn command(name: &str, arguments: &[&str]) -> Cmd {
 }
 
 /// Reads all leases that the server has.
-pub(super) async fn load(shared: &Shared, leases: &Leases) -> Result<Vec<(String, Bytes)>, BrokerError> {
+pub(super) async fn load(
+    shared: &Shared,
+    leases: &Leases,
+) -> Result<Vec<(String, Bytes)>, BrokerError> {
     if let Some(why) = shared.state.why_not_up() {
         return Err(BrokerError::Away(why));
     }
@@ -313,10 +319,7 @@ mod tests {
     }
 
     fn changes(changes: &[(&str, Option<&'static str>)]) -> Vec<(String, Option<Bytes>)> {
-        changes
-            .iter()
-            .map(|(key, text)| ((*key).to_owned(), text.map(value)))
-            .collect()
+        changes.iter().map(|(key, text)| ((*key).to_owned(), text.map(value))).collect()
     }
 
     #[test]

@@ -59,7 +59,8 @@ pub(super) enum Look {
     Silent,
 }
 
-/// Counts looks without a sign of life. Time would not do: where this process stood still, answers may lie unread.
+/// Counts looks without a sign of life. Time would not do: where this process stood still, answers
+/// may lie unread.
 #[derive(Debug)]
 pub(super) struct Watch {
     quiet: usize,
@@ -68,10 +69,7 @@ pub(super) struct Watch {
 
 impl Watch {
     pub(super) fn new(large: bool) -> Self {
-        Self {
-            quiet: 0,
-            silent_after: if large { SILENT_AFTER_LARGE } else { SILENT_AFTER },
-        }
+        Self { quiet: 0, silent_after: if large { SILENT_AFTER_LARGE } else { SILENT_AFTER } }
     }
 
     /// Looks, once per [`LOOK`].

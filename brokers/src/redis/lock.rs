@@ -46,7 +46,8 @@ impl Default for Scripts {
 }
 
 impl RedisKeys {
-    /// As [`RedisKeys::apply`], if the lock is held by its owner at that instant; returns whether it was. Otherwise nothing is done.
+    /// As [`RedisKeys::apply`], if the lock is held by its owner at that instant; returns whether
+    /// it was. Otherwise nothing is done.
     ///
     /// # Errors
     /// [`KeyError`].
@@ -80,12 +81,17 @@ impl RedisKeys {
             .await
     }
 
-    /// Takes a lock that nobody has, or goes on having it, for so long from now. Who had it before leaves a note beside it,
-    /// which is kept for a day; who takes it gets the one that is there.
+    /// Takes a lock that nobody has, or goes on having it, for so long from now. Who had it before
+    /// leaves a note beside it, which is kept for a day; who takes it gets the one that is there.
     ///
     /// # Errors
     /// [`KeyError`]: then it may run out, or be had.
-    pub async fn hold(&self, lock: &RedisLock, time: Duration, note: Option<&str>) -> Result<Held, KeyError> {
+    pub async fn hold(
+        &self,
+        lock: &RedisLock,
+        time: Duration,
+        note: Option<&str>,
+    ) -> Result<Held, KeyError> {
         let mut call = self.scripts.hold.key(self.settings.names.key(&lock.key));
         call.key(self.settings.names.key(&format!("{}:told", lock.key)))
             .arg(&lock.owner)
@@ -94,7 +100,9 @@ impl RedisKeys {
             // An empty note is none.
             .arg(note.unwrap_or_default());
         let (is_held, note) = self
-            .call(|mut connection| async move { call.invoke_async::<(bool, Option<String>)>(&mut connection).await })
+            .call(|mut connection| async move {
+                call.invoke_async::<(bool, Option<String>)>(&mut connection).await
+            })
             .await?;
         Ok(Held { is_held, note })
     }
@@ -111,7 +119,8 @@ impl RedisKeys {
     }
 }
 
-/// Taken when free, prolonged when one's own. Who had it before leaves its note, and everybody gets what is there.
+/// Taken when free, prolonged when one's own. Who had it before leaves its note, and everybody gets
+/// what is there.
 const HOLD: &str = r"
 local owner = redis.call('GET', KEYS[1])
 if owner and owner ~= ARGV[1] then return { 0, redis.call('GET', KEYS[2]) } end

@@ -1,4 +1,5 @@
-//! Redis and Valkey: publish and subscribe, what is kept for late joiners, the flow's leases, and whose scope it is.
+//! Redis and Valkey: publish and subscribe, what is kept for late joiners, the flow's leases, and
+//! whose scope it is.
 //!
 //! ```text
 //! publisher ─► Gate (queues) ─► Writer ──► connection "publish"        ┐ one more of each for large
@@ -8,8 +9,9 @@
 //! all of them ──► State ─► status, gates, whether messages are delivered
 //! ```
 //!
-//! Redis delivers at most once. What was handed to it and not answered when the connection was lost counts as dropped and is
-//! never sent again; what was published while a reader was away is missing.
+//! Redis delivers at most once. What was handed to it and not answered when the connection was lost
+//! counts as dropped and is never sent again; what was published while a reader was away is
+//! missing.
 
 mod connection;
 mod flow_side;
@@ -49,8 +51,8 @@ pub use lock::RedisLock;
 use crate::open::OpenError;
 use crate::outbox::LanePublisher;
 use crate::port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Publisher, PublisherOptions, Role, SubscribeOptions,
-    Subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Publisher, PublisherOptions, Role,
+    SubscribeOptions, Subscription,
 };
 use flow_side::RedisFlowSide;
 use gate::Gate;
@@ -110,7 +112,10 @@ impl Shared {
         Self {
             state: Arc::new(State::new(scope, settings.place.clone(), gates.clone())),
             gates,
-            subscriptions: [Subscriptions::new(Arc::clone(&channels)), Subscriptions::new(channels)],
+            subscriptions: [
+                Subscriptions::new(Arc::clone(&channels)),
+                Subscriptions::new(channels),
+            ],
             connections: std::array::from_fn(|_| watch::Sender::new(None)),
             mirror: Mutex::default(),
             last_run: Mutex::default(),
@@ -153,7 +158,8 @@ impl Shared {
         up.then(|| self.connection(line)).flatten()
     }
 
-    /// Waits for the connection for commands. Commands share it with small messages, of which little is under way.
+    /// Waits for the connection for commands. Commands share it with small messages, of which
+    /// little is under way.
     async fn commands(&self) -> MultiplexedConnection {
         let mut version = self.state.version();
         loop {
@@ -170,9 +176,7 @@ impl Shared {
     fn met(&self, facts: ServerFacts, limits: Option<BufferLimits>) {
         let before = self.last_run.lock().replace(facts.run_id.clone());
         // Where the server does not tell, it may have been restarted.
-        let same = before
-            .as_ref()
-            .is_none_or(|before| before.is_some() && *before == facts.run_id);
+        let same = before.as_ref().is_none_or(|before| before.is_some() && *before == facts.run_id);
         if !same {
             tracing::info!(
                 server = facts.version,
@@ -219,9 +223,8 @@ impl RedisBroker {
     pub fn open(section: &Section, role: &Role) -> Result<Self, OpenError> {
         let settings = Settings::read(section)?;
         let leases = settings.names.leases();
-        let runtime = tokio::runtime::Handle::try_current().map_err(|error| OpenError::Setting {
-            key: "redis".to_owned(),
-            reason: error.to_string(),
+        let runtime = tokio::runtime::Handle::try_current().map_err(|error| {
+            OpenError::Setting { key: "redis".to_owned(), reason: error.to_string() }
         })?;
         let broker = Self {
             shared: Arc::new(Shared::new(settings, role)),
@@ -250,8 +253,7 @@ impl RedisBroker {
         }
         self.shared.state.set_line(line, LineState::Starting);
         let kept = connection::keep(Arc::clone(&self.shared), line);
-        self.supervisor
-            .spawn(format!("redis-{}", line.name()), TaskPolicy::MayEnd, kept);
+        self.supervisor.spawn(format!("redis-{}", line.name()), TaskPolicy::MayEnd, kept);
     }
 
     fn start_flow(&self) {
@@ -274,10 +276,7 @@ impl RedisBroker {
         if self.is_closing() {
             return Err(BrokerError::Closed);
         }
-        self.shared
-            .state
-            .why_not_up()
-            .map_or(Ok(()), |why| Err(BrokerError::Away(why)))
+        self.shared.state.why_not_up().map_or(Ok(()), |why| Err(BrokerError::Away(why)))
     }
 }
 
@@ -291,7 +290,11 @@ impl Broker for RedisBroker {
         self.shared.state.status()
     }
 
-    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError> {
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError> {
         if self.is_closing() {
             return Err(BrokerError::Closed);
         }
@@ -304,7 +307,11 @@ impl Broker for RedisBroker {
         }))
     }
 
-    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
         self.check_up()?;
         let line = Line::read(options.large);
         self.start(line);

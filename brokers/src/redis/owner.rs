@@ -54,7 +54,10 @@ return 'held ' .. held
 });
 
 static RELEASE_OURS: LazyLock<Script> = LazyLock::new(|| {
-    Script::new("if redis.call('GET', KEYS[1]) == ARGV[1] then return redis.call('DEL', KEYS[1]) end return 0")
+    Script::new(
+        "if redis.call('GET', KEYS[1]) == ARGV[1] then return redis.call('DEL', KEYS[1]) end \
+         return 0",
+    )
 });
 
 /// What a claim gave.
@@ -100,13 +103,7 @@ pub(super) struct Owner {
 
 impl Owner {
     pub(super) fn new(shared: Arc<Shared>, leases: Arc<Leases>, flow: String, epoch: u64) -> Self {
-        Self {
-            shared,
-            leases,
-            flow,
-            epoch: epoch.to_string(),
-            renewed: None,
-        }
+        Self { shared, leases, flow, epoch: epoch.to_string(), renewed: None }
     }
 
     /// Claims and renews until the broker is closed.
@@ -164,7 +161,8 @@ impl Owner {
                 self.shared.state.set_scope(Scope::HeldBy(whom));
             }
             Err(error) if server::is_refusal(&error) => {
-                // Refused once is not yet refused for good: a server that loads its data says no for a moment.
+                // Refused once is not yet refused for good: a server that loads its data says no
+                // for a moment.
                 if self.renewed.is_none() {
                     self.shared
                         .state
@@ -182,7 +180,8 @@ impl Owner {
     }
 }
 
-/// Waits until the scope is to be claimed again: soon where nobody knows whose it is, else in due time.
+/// Waits until the scope is to be claimed again: soon where nobody knows whose it is, else in due
+/// time.
 async fn due(shared: &Shared, sent: Instant) {
     let mut version = shared.state.version();
     let urgent = async {
@@ -203,7 +202,12 @@ async fn due(shared: &Shared, sent: Instant) {
     }
 }
 
-async fn claim(mut connection: MultiplexedConnection, key: String, flow: String, epoch: String) -> RedisResult<Claim> {
+async fn claim(
+    mut connection: MultiplexedConnection,
+    key: String,
+    flow: String,
+    epoch: String,
+) -> RedisResult<Claim> {
     let answer: String = CLAIM
         .key(key)
         .arg(&flow)

@@ -4,7 +4,8 @@
 //! publisher ─► Gate: outbox ─► Writer: batches of PUBLISH, some under way at once ─► answers settle messages
 //! ```
 //!
-//! What was handed to the server once is never sent again: unanswered when the connection is lost, it counts as dropped.
+//! What was handed to the server once is never sent again: unanswered when the connection is lost,
+//! it counts as dropped.
 
 use std::sync::Arc;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
@@ -61,7 +62,8 @@ impl ToRedisArgs for TwoParts<'_> {
 
 fn publish_command(channel: &str, head: &[u8], payload: &[u8]) -> Cmd {
     const NAME: &str = "PUBLISH";
-    let mut command = Cmd::with_capacity(3, NAME.len() + channel.len() + head.len() + payload.len());
+    let mut command =
+        Cmd::with_capacity(3, NAME.len() + channel.len() + head.len() + payload.len());
     command.arg(NAME).arg(channel).arg(TwoParts(head, payload));
     command
 }
@@ -99,7 +101,9 @@ impl Batch {
     pub(super) fn publish(&mut self, waiting: Waiting<Target>, keeper: &Keeper<'_>, now: Instant) {
         let to = Arc::clone(&waiting.to);
         match &waiting.body {
-            Body::Bare(payload) => self.add(publish_command(&to.channel, &[], payload), payload.len()),
+            Body::Bare(payload) => {
+                self.add(publish_command(&to.channel, &[], payload), payload.len())
+            }
             Body::Frame(frame) => {
                 let frame = Waiting::<Target>::aged(frame, waiting.since, now);
                 let head = frame.head_to_write();
@@ -113,7 +117,14 @@ impl Batch {
         self.receipts.push((self.pipeline.len() - 1, waiting.into_receipt()));
     }
 
-    fn keep(&mut self, keeper: &Keeper<'_>, to: &Arc<Target>, kept: &KeptTarget, head: &Bytes, frame: &Frame) {
+    fn keep(
+        &mut self,
+        keeper: &Keeper<'_>,
+        to: &Arc<Target>,
+        kept: &KeptTarget,
+        head: &Bytes,
+        frame: &Frame,
+    ) {
         let key = (Arc::clone(&kept.hash), frame.writer());
         let newest = KeptFrame {
             written_ns: unix_time_ns(),
@@ -145,7 +156,9 @@ impl Batch {
         let mut refusals = Refusals::default();
         for (index, receipt) in self.receipts {
             match answers.get(index) {
-                Some(redis::Value::ServerError(_)) | None => receipt.settle(Fate::Dropped(DropReason::BrokerError)),
+                Some(redis::Value::ServerError(_)) | None => {
+                    receipt.settle(Fate::Dropped(DropReason::BrokerError))
+                }
                 Some(_) => receipt.settle(Fate::Delivered),
             }
         }
@@ -189,11 +202,8 @@ mod tests {
     use blaze_proto::Header;
     use parking_lot::Mutex;
 
-    const LIMITS: OutboxLimits = OutboxLimits {
-        lane_messages: 100,
-        lane_bytes: 100_000,
-        total_bytes: 100_000,
-    };
+    const LIMITS: OutboxLimits =
+        OutboxLimits { lane_messages: 100, lane_bytes: 100_000, total_bytes: 100_000 };
 
     fn frame(sequence: u64) -> Frame {
         let header = Header::new("t", Origin::default(), WriterId([1; 16]), sequence, 0);
@@ -201,10 +211,7 @@ mod tests {
     }
 
     fn target(depth: u32) -> Target {
-        let options = PublisherOptions {
-            depth,
-            ..PublisherOptions::default()
-        };
+        let options = PublisherOptions { depth, ..PublisherOptions::default() };
         Target::new(&Names::new("p:"), &"t".parse().unwrap(), options)
     }
 
@@ -228,18 +235,12 @@ mod tests {
         let waiting = taken.pop().unwrap();
         let later = waiting.since + Duration::from_millis(5);
         let mirror = Mutex::new(Mirror::default());
-        let keeper = Keeper {
-            mirror: &mirror,
-            line: Line::PublishSmall,
-        };
+        let keeper = Keeper { mirror: &mirror, line: Line::PublishSmall };
         let mut batch = Batch::with_capacity(1);
         batch.publish(waiting, &keeper, later);
         let commands: Vec<_> = batch.pipeline.cmd_iter().map(arguments).collect();
         assert_eq!(commands.len(), 1);
-        assert_eq!(
-            (&commands[0][0][..], &commands[0][1][..]),
-            (&b"PUBLISH"[..], &b"p:t"[..])
-        );
+        assert_eq!((&commands[0][0][..], &commands[0][1][..]), (&b"PUBLISH"[..], &b"p:t"[..]));
         let written = Frame::parse(Bytes::from(commands[0][2].clone())).unwrap();
         assert_eq!((written.sequence(), written.hops(), written.age_us()), (7, 2, 6_000));
         assert_eq!(written.payload(), frame(7).payload());
@@ -255,26 +256,17 @@ mod tests {
         let mut taken = Vec::new();
         outbox.take(Instant::now(), 10, 10_000, &mut taken);
         let mirror = Mutex::new(Mirror::default());
-        let keeper = Keeper {
-            mirror: &mirror,
-            line: Line::PublishSmall,
-        };
+        let keeper = Keeper { mirror: &mirror, line: Line::PublishSmall };
         let mut batch = Batch::with_capacity(3);
         for waiting in taken {
             batch.publish(waiting, &keeper, Instant::now());
         }
-        let names: Vec<_> = batch
-            .pipeline
-            .cmd_iter()
-            .map(|command| arguments(command)[0].clone())
-            .collect();
+        let names: Vec<_> =
+            batch.pipeline.cmd_iter().map(|command| arguments(command)[0].clone()).collect();
         assert_eq!(names, [b"HSET".to_vec(), b"PUBLISH".to_vec(), b"PUBLISH".to_vec()]);
         let field = batch.pipeline.cmd_iter().next().map(arguments).unwrap()[3].clone();
         let (kept, _) = read_field(Bytes::from(field), WriterId([1; 16]));
-        assert!(
-            (before..=unix_time_ns()).contains(&kept[0].0),
-            "late joiners sort by it"
-        );
+        assert!((before..=unix_time_ns()).contains(&kept[0].0), "late joiners sort by it");
         let no: redis::Value = redis::parse_redis_value(b"-NOPERM no\r\n").unwrap();
         let refusals = batch.settle(&[redis::Value::Int(1), redis::Value::Int(0), no]);
         assert_eq!(refusals.count, 1);

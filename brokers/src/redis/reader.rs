@@ -62,7 +62,11 @@ fn texts(names: &[Name]) -> Vec<&str> {
 }
 
 /// Where the access list forbids one of several, each is asked for alone.
-async fn subscribe(subscriptions: &Subscriptions, session: &Session, names: &[Name]) -> Result<(), Failure> {
+async fn subscribe(
+    subscriptions: &Subscriptions,
+    session: &Session,
+    names: &[Name],
+) -> Result<(), Failure> {
     let mut connection = session.connection.clone();
     match connection.subscribe(texts(names)).await {
         Ok(()) => subscriptions.confirm(names),
@@ -90,16 +94,26 @@ fn check(result: RedisResult<()>) -> Result<(), Failure> {
 }
 
 /// What is kept of a channel for late joiners, in the order of publishing as far as the times tell.
-pub(super) async fn read_kept(mut connection: MultiplexedConnection, hash: &str) -> Result<Vec<Received>, BrokerError> {
-    let fields = server::fields(&mut connection, (hash, "what is kept for late joiners"), READ_KEPT).await?;
+pub(super) async fn read_kept(
+    mut connection: MultiplexedConnection,
+    hash: &str,
+) -> Result<Vec<Received>, BrokerError> {
+    let fields =
+        server::fields(&mut connection, (hash, "what is kept for late joiners"), READ_KEPT).await?;
     Ok(kept_messages(fields, hash, unix_time_ns(), Instant::now()))
 }
 
-fn kept_messages(fields: Vec<(Vec<u8>, Vec<u8>)>, hash: &str, now_ns: u64, now: Instant) -> Vec<Received> {
+fn kept_messages(
+    fields: Vec<(Vec<u8>, Vec<u8>)>,
+    hash: &str,
+    now_ns: u64,
+    now: Instant,
+) -> Vec<Received> {
     let mut found = Vec::new();
     let mut damaged_fields = 0;
     for (field, value) in fields {
-        let writer: Option<WriterId> = std::str::from_utf8(&field).ok().and_then(|text| text.parse().ok());
+        let writer: Option<WriterId> =
+            std::str::from_utf8(&field).ok().and_then(|text| text.parse().ok());
         let Some(writer) = writer else {
             damaged_fields += 1;
             continue;
@@ -158,7 +172,9 @@ mod tests {
         let found: Vec<_> = kept_messages(fields, "h", 6_000_000, Instant::now())
             .into_iter()
             .map(|message| match message.content {
-                Content::Frame(frame) => (frame.writer().0[0], frame.sequence(), message.broker_age_us),
+                Content::Frame(frame) => {
+                    (frame.writer().0[0], frame.sequence(), message.broker_age_us)
+                }
                 other => panic!("{other:?}"),
             })
             .collect();

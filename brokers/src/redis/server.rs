@@ -8,7 +8,8 @@ use redis::{Cmd, InfoDict, RedisError, RedisResult};
 
 use crate::port::BrokerError;
 
-/// A subscriber is cut off when this many bytes wait for it: room for a few of the largest messages is needed.
+/// A subscriber is cut off when this many bytes wait for it: room for a few of the largest messages
+/// is needed.
 const LEAST_HARD_LIMIT: u64 = 4 * 32 * 1024 * 1024;
 /// The same for the limit that holds for some seconds: two of the largest messages.
 const LEAST_SOFT_LIMIT: u64 = 2 * 16 * 1024 * 1024;
@@ -49,11 +50,7 @@ impl BufferLimits {
     pub(super) fn parse(setting: &str) -> Option<Self> {
         let mut words = setting.split_whitespace().skip_while(|word| *word != "pubsub").skip(1);
         let mut number = || words.next()?.parse().ok();
-        Some(Self {
-            hard: number()?,
-            soft: number()?,
-            soft_seconds: number()?,
-        })
+        Some(Self { hard: number()?, soft: number()?, soft_seconds: number()? })
     }
 
     /// What is to be changed, if large messages would get a reader cut off.
@@ -61,7 +58,8 @@ impl BufferLimits {
         let low = |limit: u64, least: u64| limit != 0 && limit < least;
         (low(self.hard, LEAST_HARD_LIMIT) || low(self.soft, LEAST_SOFT_LIMIT)).then(|| {
             format!(
-                "client-output-buffer-limit is `pubsub {} {} {}`: the server closes readers of large messages; set \
+                "client-output-buffer-limit is `pubsub {} {} {}`: the server closes readers of \
+                 large messages; set \
                  `client-output-buffer-limit pubsub 256mb 128mb 60`",
                 self.hard, self.soft, self.soft_seconds
             )
@@ -73,16 +71,17 @@ impl BufferLimits {
 pub(super) async fn facts(connection: &mut MultiplexedConnection) -> RedisResult<ServerFacts> {
     match redis::cmd("INFO").arg("server").query_async(connection).await {
         Ok(info) => Ok(ServerFacts::of(&info)),
-        Err(error) if is_refusal(&error) => Ok(ServerFacts {
-            version: "redis (version not told)".to_owned(),
-            run_id: None,
-        }),
+        Err(error) if is_refusal(&error) => {
+            Ok(ServerFacts { version: "redis (version not told)".to_owned(), run_id: None })
+        }
         Err(error) => Err(error),
     }
 }
 
 /// Asks for the buffer limits; `None` where the access list forbids it.
-pub(super) async fn buffer_limits(connection: &mut MultiplexedConnection) -> RedisResult<Option<BufferLimits>> {
+pub(super) async fn buffer_limits(
+    connection: &mut MultiplexedConnection,
+) -> RedisResult<Option<BufferLimits>> {
     let mut command = redis::cmd("CONFIG");
     command.arg("GET").arg("client-output-buffer-limit");
     match command.query_async::<HashMap<String, String>>(connection).await {

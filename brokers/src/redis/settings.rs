@@ -32,26 +32,18 @@ impl Settings {
             return Err(OpenError::NotBuilt { feature: "tls" });
         }
         // The library's words for a bad URL name its part, never its text.
-        let info = url
-            .into_connection_info()
-            .map_err(|error| fault("redis.url", error.to_string()))?;
+        let info =
+            url.into_connection_info().map_err(|error| fault("redis.url", error.to_string()))?;
         let info = with_login(info, section)?;
         let info = info.set_tcp_settings(tcp_settings());
         let place = info.addr().to_string();
         let client = if tls { secure(info, section)? } else { plain(info)? };
-        Ok(Self {
-            client,
-            names: Names::new(&section.prefix),
-            place,
-        })
+        Ok(Self { client, names: Names::new(&section.prefix), place })
     }
 }
 
 fn fault(key: &str, reason: impl Into<String>) -> OpenError {
-    OpenError::Setting {
-        key: key.to_owned(),
-        reason: reason.into(),
-    }
+    OpenError::Setting { key: key.to_owned(), reason: reason.into() }
 }
 
 fn tcp_settings() -> TcpSettings {
@@ -79,7 +71,8 @@ fn with_login(info: ConnectionInfo, section: &Section) -> Result<ConnectionInfo,
 }
 
 fn read_text(key: &str, path: &Path) -> Result<String, OpenError> {
-    std::fs::read_to_string(path).map_err(|error| fault(key, format!("{}: {error}", path.display())))
+    std::fs::read_to_string(path)
+        .map_err(|error| fault(key, format!("{}: {error}", path.display())))
 }
 
 fn plain(info: ConnectionInfo) -> Result<redis::Client, OpenError> {
@@ -102,24 +95,21 @@ fn secure(info: ConnectionInfo, section: &Section) -> Result<redis::Client, Open
             insecure: false,
             tls_params: None,
         },
-        redis::ConnectionAddr::Unix(_) => return Err(fault("redis.tls", "a unix socket has no TLS")),
+        redis::ConnectionAddr::Unix(_) => {
+            return Err(fault("redis.tls", "a unix socket has no TLS"));
+        }
         other => other.clone(),
     };
     let files = section.tls.clone().unwrap_or_default();
     let bytes = |key: &str, path: &Option<std::path::PathBuf>| {
-        path.as_ref()
-            .map(|path| read_text(key, path).map(String::into_bytes))
-            .transpose()
+        path.as_ref().map(|path| read_text(key, path).map(String::into_bytes)).transpose()
     };
     let root_cert = bytes("redis.tls.ca_file", &files.ca_file)?;
     let client_cert = bytes("redis.tls.cert_file", &files.cert_file)?;
     let client_key = bytes("redis.tls.key_file", &files.key_file)?;
     let client_tls = client_cert
         .zip(client_key)
-        .map(|(client_cert, client_key)| redis::ClientTlsConfig {
-            client_cert,
-            client_key,
-        });
+        .map(|(client_cert, client_key)| redis::ClientTlsConfig { client_cert, client_key });
     let certificates = redis::TlsCertificates { client_tls, root_cert };
     redis::Client::build_with_tls(info.set_addr(address), certificates)
         .map_err(|error| fault("redis.tls", error.to_string()))
@@ -133,9 +123,7 @@ pub(super) struct Names {
 
 impl Names {
     pub(super) fn new(prefix: &str) -> Self {
-        Self {
-            prefix: Arc::from(prefix),
-        }
+        Self { prefix: Arc::from(prefix) }
     }
 
     /// The channel itself.

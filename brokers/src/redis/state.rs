@@ -1,4 +1,5 @@
-//! What is known of the connections and of the scope, and what follows from it: the status, and who may read and write.
+//! What is known of the connections and of the scope, and what follows from it: the status, and who
+//! may read and write.
 //!
 //! ```text
 //! writer, reader, owner ──► State::change ──► Conditions ──┬─► status
@@ -15,7 +16,8 @@ use tokio::sync::watch;
 use super::gate::Gate;
 use crate::port::{BrokerStatus, Health, StatusCell};
 
-/// One TCP connection. Large messages have connections of their own, so that small ones never stand behind them.
+/// One TCP connection. Large messages have connections of their own, so that small ones never stand
+/// behind them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Line {
     PublishSmall,
@@ -25,7 +27,8 @@ pub(super) enum Line {
 }
 
 impl Line {
-    pub(super) const ALL: [Self; 4] = [Self::PublishSmall, Self::PublishLarge, Self::ReadSmall, Self::ReadLarge];
+    pub(super) const ALL: [Self; 4] =
+        [Self::PublishSmall, Self::PublishLarge, Self::ReadSmall, Self::ReadLarge];
 
     pub(super) fn publish(large: bool) -> Self {
         if large { Self::PublishLarge } else { Self::PublishSmall }
@@ -68,10 +71,7 @@ pub(super) struct Failure {
 
 impl Failure {
     pub(super) fn away(why: &str) -> Self {
-        Self {
-            is_refusal: false,
-            why: why.to_owned(),
-        }
+        Self { is_refusal: false, why: why.to_owned() }
     }
 }
 
@@ -133,11 +133,7 @@ impl Conditions {
     fn new(scope: Scope, place: String) -> Self {
         // Those for large messages come with the first large publisher or reader.
         let start = |line: Line| {
-            if line.is_large() {
-                LineState::Unused
-            } else {
-                LineState::Starting
-            }
+            if line.is_large() { LineState::Unused } else { LineState::Starting }
         };
         Self {
             lines: Line::ALL.map(start),
@@ -186,7 +182,9 @@ impl Conditions {
     }
 
     fn scope_open(&self) -> bool {
-        !self.closed && self.stand_back.is_none() && matches!(self.scope, Scope::Free | Scope::Owned)
+        !self.closed
+            && self.stand_back.is_none()
+            && matches!(self.scope, Scope::Free | Scope::Owned)
     }
 
     /// Whether messages for a connection are taken.
@@ -212,11 +210,7 @@ impl Conditions {
         }
         match &self.scope {
             Scope::Unclaimed => {
-                let health = if self.was_owned {
-                    Health::Down
-                } else {
-                    Health::Connecting
-                };
+                let health = if self.was_owned { Health::Down } else { Health::Connecting };
                 (health, format!("claiming the scope at {}", self.place))
             }
             Scope::HeldBy(whom) => in_use(whom),
@@ -319,7 +313,8 @@ impl State {
 
     fn tell(&self, conditions: &Conditions) {
         let (health, detail) = conditions.health();
-        let is_away = |line: &LineState| matches!(line, LineState::Failed(failure) if !failure.is_refusal);
+        let is_away =
+            |line: &LineState| matches!(line, LineState::Failed(failure) if !failure.is_refusal);
         let unreachable = health == Health::Connecting && conditions.lines.iter().any(is_away);
         if unreachable && !self.told.swap(true, Ordering::AcqRel) {
             tracing::warn!(detail, "redis cannot be reached, trying on");
@@ -329,7 +324,9 @@ impl State {
         };
         match health {
             Health::Up if turned => tracing::info!(detail, "redis is up"),
-            Health::Down | Health::InUse if turned => tracing::warn!(detail, "redis cannot be used"),
+            Health::Down | Health::InUse if turned => {
+                tracing::warn!(detail, "redis cannot be used")
+            }
             _ => tracing::debug!(?health, detail, "redis"),
         }
     }
@@ -406,14 +403,8 @@ mod tests {
     fn a_server_that_was_never_there_is_connecting_and_one_that_says_no_is_down() {
         let mut c = conditions(Scope::Free);
         c.set_line(Line::ReadSmall, away("connection refused"));
-        assert_eq!(
-            c.health(),
-            (Health::Connecting, "host:1: connection refused".to_owned())
-        );
-        let refused = Failure {
-            is_refusal: true,
-            why: "WRONGPASS".to_owned(),
-        };
+        assert_eq!(c.health(), (Health::Connecting, "host:1: connection refused".to_owned()));
+        let refused = Failure { is_refusal: true, why: "WRONGPASS".to_owned() };
         c.set_line(Line::PublishSmall, LineState::Failed(refused));
         assert_eq!(c.health(), (Health::Down, "host:1: WRONGPASS".to_owned()));
     }
@@ -444,10 +435,7 @@ mod tests {
         assert_eq!(c.health().0, Health::Down, "the server was restarted");
         c.set_scope(Scope::Owned);
         c.stand_back = Some("fog/first".to_owned());
-        assert_eq!(
-            c.health(),
-            (Health::InUse, "scope_in_use: fog/first holds it".to_owned())
-        );
+        assert_eq!(c.health(), (Health::InUse, "scope_in_use: fog/first holds it".to_owned()));
         assert!(!c.accepts(Line::PublishSmall));
     }
 
@@ -461,10 +449,7 @@ mod tests {
         }
         c.set_line(Line::PublishSmall, away("reset"));
         c.set_line(Line::PublishSmall, LineState::Up);
-        assert_eq!(
-            c.health(),
-            (Health::Up, "redis 7; reading was interrupted 2 times".to_owned())
-        );
+        assert_eq!(c.health(), (Health::Up, "redis 7; reading was interrupted 2 times".to_owned()));
         c.closed = true;
         assert_eq!(c.health().0, Health::Closed);
     }

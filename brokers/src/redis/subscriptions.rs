@@ -1,4 +1,5 @@
-//! Who reads which channel over one connection: what is to be subscribed at the server, and where messages go.
+//! Who reads which channel over one connection: what is to be subscribed at the server, and where
+//! messages go.
 //!
 //! ```text
 //! subscribe ─► add ─► Asked ─ take_work ─► Asking ─ confirm ─► Subscribed ─┐ deliver ─► readers
@@ -6,8 +7,8 @@
 //!                       └──────────── forget_server (connection lost) ─────┘ last reader gone ─► unsubscribe
 //! ```
 //!
-//! One SUBSCRIBE serves all readers of a channel. SUBSCRIBE and UNSUBSCRIBE are sent by one task, one after the other, so a
-//! channel that is left and wanted again ends up subscribed.
+//! One SUBSCRIBE serves all readers of a channel. SUBSCRIBE and UNSUBSCRIBE are sent by one task,
+//! one after the other, so a channel that is left and wanted again ends up subscribed.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -21,7 +22,10 @@ use futures::FutureExt as _;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, oneshot};
 
-use crate::port::{BrokerError, Content, Received, SubscribeOptions, Subscription, SubscriptionSender, subscription};
+use crate::port::{
+    BrokerError, Content, Received, SubscribeOptions, Subscription, SubscriptionSender,
+    subscription,
+};
 
 /// Channels that one broker reads at most, over all its connections.
 const MAX_CHANNELS: usize = 10_000;
@@ -46,7 +50,8 @@ enum Stage {
 enum Phase {
     /// All that comes.
     Live,
-    /// Nothing yet: what is kept for late joiners is being read. What comes meanwhile waits in a subscription of its own.
+    /// Nothing yet: what is kept for late joiners is being read. What comes meanwhile waits in a
+    /// subscription of its own.
     Joining(SubscriptionSender, Subscription),
     /// All but what it got from what is kept: per writer, the highest sequence.
     Filtered(HashMap<WriterId, u64>),
@@ -88,7 +93,9 @@ impl Reader {
             }
         }
         self.sender.send_kept(kept);
-        if let Phase::Joining(_, mut held) = std::mem::replace(&mut self.phase, Phase::Filtered(highest)) {
+        if let Phase::Joining(_, mut held) =
+            std::mem::replace(&mut self.phase, Phase::Filtered(highest))
+        {
             let mut messages = Vec::new();
             let _ = held.receive(&mut messages, usize::MAX).now_or_never();
             self.sender.note_lost(held.take_dropped());
@@ -99,7 +106,8 @@ impl Reader {
     }
 }
 
-/// Whether a message was among what is kept. The first that was not is the last of its writer to be compared.
+/// Whether a message was among what is kept. The first that was not is the last of its writer to be
+/// compared.
 fn is_repeat(highest: &mut HashMap<WriterId, u64>, content: &Content) -> bool {
     let Content::Frame(frame) = content else { return false };
     match highest.get(&frame.writer()) {
@@ -153,11 +161,7 @@ pub(super) struct Subscriptions {
 
 impl Subscriptions {
     pub(super) fn new(count: Arc<AtomicUsize>) -> Arc<Self> {
-        Arc::new(Self {
-            channels: Mutex::default(),
-            changed: Notify::new(),
-            count,
-        })
+        Arc::new(Self { channels: Mutex::default(), changed: Notify::new(), count })
     }
 
     /// Adds a reader. What comes is his once the confirmation says so.
@@ -220,7 +224,9 @@ impl Subscriptions {
     pub(super) fn join(&self, name: &Name, id: u64, kept: Vec<Received>) {
         let mut channels = self.channels.lock();
         let readers = channels.by_name.get_mut(name).map(|channel| &mut channel.readers);
-        if let Some(reader) = readers.and_then(|readers| readers.iter_mut().find(|reader| reader.id == id)) {
+        if let Some(reader) =
+            readers.and_then(|readers| readers.iter_mut().find(|reader| reader.id == id))
+        {
             reader.join(kept);
         }
     }
@@ -233,7 +239,8 @@ impl Subscriptions {
         let Some(channel) = channels.by_name.get_mut(name) else {
             return;
         };
-        // One that is to be subscribed anew was left before: what still comes is of the time before.
+        // One that is to be subscribed anew was left before: what still comes is of the time
+        // before.
         if channel.stage == Stage::Asked || channel.readers.is_empty() {
             return;
         }
@@ -304,10 +311,8 @@ impl Subscriptions {
             return;
         };
         for waiting in channel.waiting {
-            let _ = waiting.send(Err(BrokerError::Name {
-                channel: name.to_string(),
-                reason: why.to_owned(),
-            }));
+            let _ = waiting
+                .send(Err(BrokerError::Name { channel: name.to_string(), reason: why.to_owned() }));
         }
         for reader in channel.readers {
             reader.sender.close();

@@ -11,11 +11,13 @@ fn registry() -> Arc<Subscriptions> {
     Subscriptions::new(Arc::default())
 }
 
-fn add_with(registry: &Subscriptions, name: &str, options: SubscribeOptions) -> (Subscription, Added) {
+fn add_with(
+    registry: &Subscriptions,
+    name: &str,
+    options: SubscribeOptions,
+) -> (Subscription, Added) {
     let (sender, subscription) = subscription(options);
-    let added = registry
-        .add(&Arc::from(name), &name.parse().unwrap(), sender, options)
-        .unwrap();
+    let added = registry.add(&Arc::from(name), &name.parse().unwrap(), sender, options).unwrap();
     (subscription, added)
 }
 
@@ -28,17 +30,11 @@ fn subscribe_all(registry: &Subscriptions) {
 }
 
 fn subscribe(wanted: &[&str]) -> Work {
-    Work {
-        subscribe: names(wanted),
-        ..Work::default()
-    }
+    Work { subscribe: names(wanted), ..Work::default() }
 }
 
 fn unsubscribe(unwanted: &[&str]) -> Work {
-    Work {
-        unsubscribe: names(unwanted),
-        ..Work::default()
-    }
+    Work { unsubscribe: names(unwanted), ..Work::default() }
 }
 
 fn names(names: &[&str]) -> Vec<Name> {
@@ -47,17 +43,11 @@ fn names(names: &[&str]) -> Vec<Name> {
 
 fn frame(writer: u8, sequence: u64) -> Vec<u8> {
     let header = Header::new("t", Origin::default(), WriterId([writer; 16]), sequence, 0);
-    Frame::new(&header, Bytes::from_static(b"x"))
-        .unwrap()
-        .to_bytes()
-        .to_vec()
+    Frame::new(&header, Bytes::from_static(b"x")).unwrap().to_bytes().to_vec()
 }
 
 fn received(writer: u8, sequence: u64) -> Received {
-    Received::live(
-        Content::from_bytes(Bytes::from(frame(writer, sequence))),
-        Instant::now(),
-    )
+    Received::live(Content::from_bytes(Bytes::from(frame(writer, sequence))), Instant::now())
 }
 
 fn deliver(registry: &Subscriptions, name: &str, payload: &[u8]) {
@@ -144,10 +134,7 @@ fn after_a_lost_connection_all_is_subscribed_again() {
     let (_b, mut two) = add(&registry, "b");
     assert_eq!(registry.take_work().subscribe.len(), 2);
     registry.fail_waiting("gone");
-    assert_eq!(
-        two.confirmation.try_recv(),
-        Ok(Err(BrokerError::Away("gone".to_owned())))
-    );
+    assert_eq!(two.confirmation.try_recv(), Ok(Err(BrokerError::Away("gone".to_owned()))));
     registry.forget_server();
     let mut again = registry.take_work().subscribe;
     again.sort();
@@ -160,7 +147,10 @@ fn a_refused_channel_ends_its_readers() {
     let (mut subscription, mut added) = add(&registry, "a");
     registry.take_work();
     registry.refuse(&Arc::from("a"), "NOPERM");
-    assert!(matches!(added.confirmation.try_recv(), Ok(Err(BrokerError::Name { reason, .. })) if reason == "NOPERM"));
+    assert!(matches!(
+        added.confirmation.try_recv(),
+        Ok(Err(BrokerError::Name { reason, .. })) if reason == "NOPERM",
+    ));
     let mut batch = Vec::new();
     let ended = futures::FutureExt::now_or_never(subscription.receive(&mut batch, 1));
     assert_eq!(ended, Some(0));
@@ -173,12 +163,8 @@ fn channels_are_bounded_over_all_connections() {
     let (_reader, _added) = add(&small, "a");
     let (_same, _added) = add(&small, "a");
     let (sender, _subscription) = subscription(SubscribeOptions::default());
-    let refused = large.add(
-        &Arc::from("b"),
-        &"b".parse().unwrap(),
-        sender,
-        SubscribeOptions::default(),
-    );
+    let refused =
+        large.add(&Arc::from("b"), &"b".parse().unwrap(), sender, SubscribeOptions::default());
     assert_eq!(refused.err(), Some(BrokerError::TooManyChannels(MAX_CHANNELS)));
     small.close();
     add(&large, "b");
@@ -187,10 +173,7 @@ fn channels_are_bounded_over_all_connections() {
 #[test]
 fn a_late_joiner_gets_what_is_kept_first_and_nothing_twice() {
     let registry = registry();
-    let options = SubscribeOptions {
-        with_kept: true,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { with_kept: true, ..SubscribeOptions::default() };
     let (mut late, added) = add_with(&registry, "a", options);
     subscribe_all(&registry);
     deliver(&registry, "a", &frame(1, 4));
@@ -208,11 +191,8 @@ fn a_late_joiner_gets_what_is_kept_first_and_nothing_twice() {
 #[test]
 fn what_is_held_for_a_late_joiner_is_bounded() {
     let registry = registry();
-    let options = SubscribeOptions {
-        with_kept: true,
-        max_messages: 2,
-        ..SubscribeOptions::default()
-    };
+    let options =
+        SubscribeOptions { with_kept: true, max_messages: 2, ..SubscribeOptions::default() };
     let (mut late, added) = add_with(&registry, "a", options);
     subscribe_all(&registry);
     for sequence in 1..=5 {

@@ -21,7 +21,8 @@ use crate::outbox::Waiting;
 const BATCH_MESSAGES: usize = 64;
 /// Bytes of one batch at most; one message always fits.
 const BATCH_BYTES: usize = 256 * 1024;
-/// Batches that are under way at once: enough for 64 × 8 messages per round trip, few enough that batches fill up.
+/// Batches that are under way at once: enough for 64 × 8 messages per round trip, few enough that
+/// batches fill up.
 const BATCHES: usize = 8;
 /// Nothing more is handed over while this much is not answered.
 const UNANSWERED_BYTES: usize = 1024 * 1024;
@@ -45,10 +46,12 @@ pub(super) struct Writer<'a> {
     complained: Option<Instant>,
 }
 
-async fn send(mut connection: MultiplexedConnection, _busy: Busy, batch: Batch) -> Result<(usize, Refusals), Failure> {
-    let answers = connection
-        .send_packed_commands(&batch.pipeline, 0, batch.pipeline.len())
-        .await?;
+async fn send(
+    mut connection: MultiplexedConnection,
+    _busy: Busy,
+    batch: Batch,
+) -> Result<(usize, Refusals), Failure> {
+    let answers = connection.send_packed_commands(&batch.pipeline, 0, batch.pipeline.len()).await?;
     // Not answered, the messages count as dropped.
     Ok((batch.bytes, batch.settle(&answers)))
 }
@@ -57,10 +60,7 @@ impl<'a> Writer<'a> {
     pub(super) fn new(shared: &'a Shared, line: Line) -> Self {
         Self {
             shared,
-            keeper: Keeper {
-                mirror: &shared.mirror,
-                line,
-            },
+            keeper: Keeper { mirror: &shared.mirror, line },
             gate: shared.gate(line.is_large()),
             taken: Vec::with_capacity(BATCH_MESSAGES),
             rewrites_next: false,
@@ -109,7 +109,10 @@ impl<'a> Writer<'a> {
 
     fn rewrite(&self) -> Option<Batch> {
         let mut batch = Batch::with_capacity(1);
-        while batch.pipeline.len() < BATCH_MESSAGES && batch.bytes < BATCH_BYTES && batch.rewrite(&self.keeper) {}
+        while batch.pipeline.len() < BATCH_MESSAGES
+            && batch.bytes < BATCH_BYTES
+            && batch.rewrite(&self.keeper)
+        {}
         (!batch.pipeline.is_empty()).then_some(batch)
     }
 

@@ -121,17 +121,24 @@ struct Percentiles {
     p99: Option<f64>,
 }
 
-pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String, CliError> {
+pub(super) fn table(
+    flow: &FlowAddress,
+    value: &Value,
+    width: Option<u16>,
+) -> Result<String, CliError> {
     let answer: Bridges = typed(flow, value)?;
     let mut text = heading(value);
     if answer.bridges.is_empty() {
         text.push_str(
-            "No bridges: nothing that is published here is asked for elsewhere. `blaze why TOPIC` says what is missing.\n",
+            "No bridges: nothing that is published here is asked for elsewhere. `blaze why TOPIC` \
+             says what is missing.\n",
         );
         text.push_str(&group_text(&answer));
         return Ok(text);
     }
-    let millis = |bridge: &Bridge, part: fn(Percentiles) -> Option<f64>| number(bridge.latency_ms.and_then(part), 2);
+    let millis = |bridge: &Bridge, part: fn(Percentiles) -> Option<f64>| {
+        number(bridge.latency_ms.and_then(part), 2)
+    };
     text.push_str(&output::table(
         &answer.bridges,
         width,
@@ -209,11 +216,7 @@ pub(crate) fn dropped_text(dropped: &BTreeMap<String, u64>) -> String {
         .filter(|(_, count)| **count > 0)
         .map(|(reason, count)| format!("{reason} {count}"))
         .collect();
-    if parts.is_empty() {
-        "-".to_owned()
-    } else {
-        parts.join(", ")
-    }
+    if parts.is_empty() { "-".to_owned() } else { parts.join(", ") }
 }
 
 #[cfg(test)]
@@ -224,11 +227,19 @@ mod tests {
     #[test]
     fn bridges_are_a_table() {
         let value = json!({"flow": "edge/robot-1", "bridges": [
-            {"id": "imu/data|node>inter|cloud", "topic": "imu/data", "from": {"scope": "node", "broker": "memory"},
-             "to": {"scope": "inter", "broker": "dds", "layer": "cloud", "flow": "cloud/cloud-1"}, "state": "up",
-             "since_s": 3, "in": {"messages": 100, "bytes": 1}, "out": {"messages": 97, "bytes": 1}, "queued": 1,
+            {"id": "imu/data|node>inter|cloud", "topic": "imu/data",
+                "from": {"scope": "node", "broker": "memory"},
+             "to": {
+                 "scope": "inter",
+                 "broker": "dds",
+                 "layer": "cloud",
+                 "flow": "cloud/cloud-1",
+             }, "state": "up",
+             "since_s": 3, "in": {"messages": 100, "bytes": 1}, "out": {"messages": 97, "bytes": 1},
+             "queued": 1,
              "load_bytes_per_s": 16896,
-             "dropped": {"queue_full": 0, "lifespan": 2}, "latency_ms": {"p50": 0.51, "p99": null}}]});
+             "dropped": {"queue_full": 0, "lifespan": 2},
+             "latency_ms": {"p50": 0.51, "p99": null}}]});
         let flow = "127.0.0.1:9101".parse().unwrap();
         assert_eq!(
             table(&flow, &value, None).unwrap(),
@@ -240,9 +251,12 @@ mod tests {
 
     #[test]
     fn who_carries_what_of_a_layer_is_said_below() {
-        let value = json!({"flow": "cloud/cloud-1", "bridges": [], "not_owner": [{"topic": "cmd/vel", "owner": "cloud/cloud-2"}],
-            "balance": {"out_bytes_per_s": 102_400, "in_bytes_per_s": 0, "moves": {"load": 1, "settled": 0, "taken_back": 0},
-                        "last_move": {"topic": "map", "to": "cloud/cloud-2", "reason": "load", "ago_s": 12.4}}});
+        let value = json!({"flow": "cloud/cloud-1", "bridges": [],
+            "not_owner": [{"topic": "cmd/vel", "owner": "cloud/cloud-2"}],
+            "balance": {"out_bytes_per_s": 102_400, "in_bytes_per_s": 0,
+                "moves": {"load": 1, "settled": 0, "taken_back": 0},
+                        "last_move": {"topic": "map", "to": "cloud/cloud-2", "reason": "load",
+                            "ago_s": 12.4}}});
         let flow = "127.0.0.1:9101".parse().unwrap();
         let text = table(&flow, &value, None).unwrap();
         assert!(
@@ -258,7 +272,8 @@ mod tests {
     #[test]
     fn a_failed_bridge_says_why() {
         let value = json!({"flow": "fog/fog-1", "bridges": [
-            {"topic": "imu/data", "from": {"scope": "node", "broker": "redis"}, "to": {"scope": "layer", "broker": "kafka"},
+            {"topic": "imu/data", "from": {"scope": "node", "broker": "redis"},
+                "to": {"scope": "layer", "broker": "kafka"},
              "state": "failed", "detail": "no such name"}]});
         let flow = "127.0.0.1:9101".parse().unwrap();
         let text = table(&flow, &value, None).unwrap();

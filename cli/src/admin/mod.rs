@@ -112,10 +112,8 @@ async fn show(
 /// # Errors
 /// [`CliError::Answer`] where a field is missing or of another kind.
 pub fn typed<T: DeserializeOwned>(flow: &FlowAddress, value: &Value) -> Result<T, CliError> {
-    T::deserialize(value).map_err(|error| CliError::Answer {
-        address: flow.to_string(),
-        reason: error.to_string(),
-    })
+    T::deserialize(value)
+        .map_err(|error| CliError::Answer { address: flow.to_string(), reason: error.to_string() })
 }
 
 /// A text that may be missing or `null`: then it is empty.

@@ -50,11 +50,18 @@ struct Peer {
     address: Option<String>,
 }
 
-pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String, CliError> {
+pub(super) fn table(
+    flow: &FlowAddress,
+    value: &Value,
+    width: Option<u16>,
+) -> Result<String, CliError> {
     let answer: Peers = typed(flow, value)?;
     let mut text = heading(value);
     if answer.peers.is_empty() {
-        text.push_str("No peers: no other flow has been heard. Check brokers.inter: domain, listen and peers.\n");
+        text.push_str(
+            "No peers: no other flow has been heard. Check brokers.inter: domain, listen \
+            and peers.\n",
+        );
         text.push_str(&replicas(&answer.replicas, width));
         return Ok(text);
     }
@@ -70,9 +77,7 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
             }),
             ("HEARD/ms", Align::Right, &|peer| number(peer.last_heard_ms, 0)),
             ("RTT/ms", Align::Right, &|peer| number(peer.rtt_ms, 2)),
-            ("LOSS/%", Align::Right, &|peer| {
-                number(peer.loss.map(|share| share * 100.0), 2)
-            }),
+            ("LOSS/%", Align::Right, &|peer| number(peer.loss.map(|share| share * 100.0), 2)),
             ("CLOCK/ms", Align::Right, &clock),
         ],
     ));
@@ -85,7 +90,9 @@ fn replicas(replicas: &[Replica], width: Option<u16>) -> String {
     if replicas.is_empty() {
         return String::new();
     }
-    let kib = |replica: &Replica, of: fn(&Load) -> f64| number(replica.load.as_ref().map(|load| of(load) / 1024.0), 1);
+    let kib = |replica: &Replica, of: fn(&Load) -> f64| {
+        number(replica.load.as_ref().map(|load| of(load) / 1024.0), 1)
+    };
     let state = |replica: &Replica| match replica.settled {
         true => "settled".to_owned(),
         false => replica.state.clone(),
@@ -98,12 +105,8 @@ fn replicas(replicas: &[Replica], width: Option<u16>) -> String {
             ("STATE", Align::Left, &state),
             ("HEARD/ms", Align::Right, &|replica| number(replica.last_heard_ms, 0)),
             ("CARRIES", Align::Right, &|replica| replica.carries.to_string()),
-            ("OUT KiB/s", Align::Right, &|replica| {
-                kib(replica, |load| load.out_bytes_per_s)
-            }),
-            ("IN KiB/s", Align::Right, &|replica| {
-                kib(replica, |load| load.in_bytes_per_s)
-            }),
+            ("OUT KiB/s", Align::Right, &|replica| kib(replica, |load| load.out_bytes_per_s)),
+            ("IN KiB/s", Align::Right, &|replica| kib(replica, |load| load.in_bytes_per_s)),
         ],
     );
     format!("\n{table}")
@@ -124,8 +127,10 @@ mod tests {
     #[test]
     fn peers_are_a_table() {
         let value = json!({"flow": "edge/robot-1", "peers": [
-            {"flow": "fog/fog-1", "layer": "fog", "kind": "fog", "epoch": 7, "version": 3, "state": "up",
-             "last_heard_ms": 120, "rtt_ms": 0.4, "clock_offset_ms": -0.01, "clock_error_ms": 0.2, "loss": 0.015,
+            {"flow": "fog/fog-1", "layer": "fog", "kind": "fog", "epoch": 7, "version": 3,
+                "state": "up",
+             "last_heard_ms": 120, "rtt_ms": 0.4, "clock_offset_ms": -0.01, "clock_error_ms": 0.2,
+             "loss": 0.015,
              "address": "10.0.3.1"},
             {"flow": "cloud/cloud-1", "kind": null, "rtt_ms": null, "state": "down"}]});
         let flow = "127.0.0.1:9101".parse().unwrap();
@@ -141,9 +146,12 @@ mod tests {
     #[test]
     fn other_flows_of_the_layer_have_a_table_of_their_own() {
         let value = json!({"flow": "cloud/cloud-1", "peers": [], "replicas": [
-            {"flow": "cloud/cloud-2", "epoch": 7, "state": "ready", "settled": true, "last_heard_ms": 120, "in_step": true,
-             "carries": 3, "load": {"out_bytes_per_s": 102_400, "in_bytes_per_s": 512, "limit_bytes_per_s": null}},
-            {"flow": "cloud/cloud-3", "state": "starting", "settled": false, "last_heard_ms": 20, "load": null}]});
+            {"flow": "cloud/cloud-2", "epoch": 7, "state": "ready", "settled": true,
+                "last_heard_ms": 120, "in_step": true,
+             "carries": 3, "load": {"out_bytes_per_s": 102_400, "in_bytes_per_s": 512,
+                 "limit_bytes_per_s": null}},
+            {"flow": "cloud/cloud-3", "state": "starting", "settled": false, "last_heard_ms": 20,
+                "load": null}]});
         let flow = "127.0.0.1:9101".parse().unwrap();
         let text = table(&flow, &value, None).unwrap();
         assert!(

@@ -79,7 +79,8 @@ struct Link {
     wire_bytes_per_s: f64,
 }
 
-/// Prints until it is interrupted, or `--count` times. On a terminal each look replaces the one before; with `-o json` each is one line.
+/// Prints until it is interrupted, or `--count` times. On a terminal each look replaces the one
+/// before; with `-o json` each is one line.
 ///
 /// # Errors
 /// What [`get_json`] says, or an answer that is not as the contract says.
@@ -125,30 +126,27 @@ fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String
             .measured_bytes_per_s
             .map(|measured| format!(", measured {}/s", bytes(measured)))
             .unwrap_or_default(),
-        if answer.feasible == Some(false) {
-            ", NOT feasible"
-        } else {
-            ""
-        },
+        if answer.feasible == Some(false) { ", NOT feasible" } else { "" },
     ));
     if answer.topics.is_empty() {
-        text.push_str("Nothing leaves on the inter scope. `blaze why TOPIC --to LAYER` says what is missing.\n");
+        text.push_str(
+            "Nothing leaves on the inter scope. `blaze why TOPIC --to LAYER` says what \
+            is missing.\n",
+        );
     } else {
         text.push_str(&lanes(&answer.topics, width));
     }
     let exceeds = |topic: &&Topic| topic.lanes.iter().any(|lane| lane.exceeds_advertised);
     for topic in answer.topics.iter().filter(exceeds) {
         text.push_str(&format!(
-            "{}: more is published than was advertised, and is skipped; let it advertise its true rate\n",
+            "{}: more is published than was advertised, and is skipped; let it advertise its true \
+             rate\n",
             topic.topic
         ));
     }
     for link in &answer.links {
         // Its own, or that of all links where that is less.
-        let limit = link
-            .limit_bytes_per_s
-            .unwrap_or(f64::INFINITY)
-            .min(answer.budget_bytes_per_s);
+        let limit = link.limit_bytes_per_s.unwrap_or(f64::INFINITY).min(answer.budget_bytes_per_s);
         let measured = link
             .measured_bytes_per_s
             .map(|measured| format!(", measured {}/s", bytes(measured)))
@@ -165,11 +163,10 @@ fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String
 }
 
 fn lanes(topics: &[Topic], width: Option<u16>) -> String {
-    let lanes: Vec<(&Topic, &Lane)> = topics
-        .iter()
-        .flat_map(|topic| topic.lanes.iter().map(move |lane| (topic, lane)))
-        .collect();
-    let ratio = |topic: &Topic| topic.compression.as_ref().and_then(|compression| compression.ratio);
+    let lanes: Vec<(&Topic, &Lane)> =
+        topics.iter().flat_map(|topic| topic.lanes.iter().map(move |lane| (topic, lane))).collect();
+    let ratio =
+        |topic: &Topic| topic.compression.as_ref().and_then(|compression| compression.ratio);
     output::table(
         &lanes,
         width,
@@ -178,12 +175,11 @@ fn lanes(topics: &[Topic], width: Option<u16>) -> String {
             ("CLASS", Align::Left, &|(topic, _)| topic.class.clone()),
             ("BYTES", Align::Right, &|(topic, _)| number(Some(topic.size_bytes), 0)),
             ("LZ4", Align::Right, &|(topic, _)| {
-                ratio(topic).map_or_else(|| "-".to_owned(), |ratio| format!("{:.0} %", 100.0 * ratio))
+                ratio(topic)
+                    .map_or_else(|| "-".to_owned(), |ratio| format!("{:.0} %", 100.0 * ratio))
             }),
             ("TO", Align::Left, &|(_, lane)| lane.layer.clone()),
-            ("ADVERTISED/Hz", Align::Right, &|(topic, _)| {
-                number(Some(topic.advertised_hz), 2)
-            }),
+            ("ADVERTISED/Hz", Align::Right, &|(topic, _)| number(Some(topic.advertised_hz), 2)),
             ("PLANNED/Hz", Align::Right, &|(_, lane)| number(lane.allocated_hz, 2)),
             ("ACTUAL/Hz", Align::Right, &|(_, lane)| number(Some(lane.actual_hz), 2)),
             ("SKIPPED", Align::Right, &|(_, lane)| lane.skipped.to_string()),
@@ -203,10 +199,13 @@ mod tests {
     #[test]
     fn planned_and_actual_stand_side_by_side() {
         let value = json!({
-            "flow": "edge/robot-1", "limit_mbps": 40, "budget_bytes_per_s": 5_242_880, "measured_bytes_per_s": null,
+            "flow": "edge/robot-1", "limit_mbps": 40, "budget_bytes_per_s": 5_242_880,
+            "measured_bytes_per_s": null,
             "wire_factor": 1.0912, "feasible": true,
-            "topics": [{"topic": "camera/image_raw", "class": "large", "size_bytes": 921_600, "advertised_hz": 30.0, "lanes": [
-                {"layer": "fog", "allocated_hz": 4.85, "actual_hz": 4.8, "skipped": 252, "queued": 1, "wait_ms": {"p50": 1.0, "p99": 190.5}}]}],
+            "topics": [{"topic": "camera/image_raw", "class": "large", "size_bytes": 921_600,
+                "advertised_hz": 30.0, "lanes": [
+                {"layer": "fog", "allocated_hz": 4.85, "actual_hz": 4.8, "skipped": 252,
+                    "queued": 1, "wait_ms": {"p50": 1.0, "p99": 190.5}}]}],
             "links": [{"layer": "fog", "limit_bytes_per_s": null, "wire_bytes_per_s": 5_137_000.0}],
         });
         let flow = "127.0.0.1:9101".parse().unwrap();
@@ -222,10 +221,27 @@ mod tests {
 
     #[test]
     fn whoever_publishes_more_than_it_says_is_named() {
-        let lane = |exceeds: bool| json!({"layer": "fog", "allocated_hz": 10, "actual_hz": 10, "exceeds_advertised": exceeds, "skipped": 40});
-        let topic = |name: &str, exceeds: bool| json!({"topic": name, "class": "standard", "size_bytes": 100, "advertised_hz": 10, "lanes": [lane(exceeds)]});
+        let lane = |exceeds: bool| {
+            json!({
+                "layer": "fog",
+                "allocated_hz": 10,
+                "actual_hz": 10,
+                "exceeds_advertised": exceeds,
+                "skipped": 40,
+            })
+        };
+        let topic = |name: &str, exceeds: bool| {
+            json!({
+                "topic": name,
+                "class": "standard",
+                "size_bytes": 100,
+                "advertised_hz": 10,
+                "lanes": [lane(exceeds)],
+            })
+        };
         let value = json!({
-            "flow": "edge/robot-1", "limit_mbps": 40, "budget_bytes_per_s": 5_242_880, "wire_factor": null,
+            "flow": "edge/robot-1", "limit_mbps": 40, "budget_bytes_per_s": 5_242_880,
+            "wire_factor": null,
             "topics": [topic("imu", true), topic("odom", false)], "links": [],
         });
         let flow = "127.0.0.1:9101".parse().unwrap();
@@ -238,7 +254,13 @@ mod tests {
 
     #[test]
     fn a_flow_that_sends_nothing_says_so() {
-        let value = json!({"flow": "fog/fog-1", "limit_mbps": 160, "budget_bytes_per_s": 1, "topics": [], "links": []});
+        let value = json!({
+            "flow": "fog/fog-1",
+            "limit_mbps": 160,
+            "budget_bytes_per_s": 1,
+            "topics": [],
+            "links": [],
+        });
         let flow = "127.0.0.1:9101".parse().unwrap();
         assert!(table(&flow, &value, None).unwrap().contains("Nothing leaves"));
     }

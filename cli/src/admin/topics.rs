@@ -53,7 +53,11 @@ impl Lease {
     }
 }
 
-pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String, CliError> {
+pub(super) fn table(
+    flow: &FlowAddress,
+    value: &Value,
+    width: Option<u16>,
+) -> Result<String, CliError> {
     let answer: Topics = typed(flow, value)?;
     let mut text = heading(value);
     if answer.topics.is_empty() {
@@ -96,8 +100,14 @@ mod tests {
     fn topics_are_a_table() {
         let value = json!({"flow": "edge/robot-1", "epoch": 1, "time": 0, "topics": [
             {"topic": "imu/data", "state": "flowing", "rate_hz": 49.93, "bytes_per_s": 16450,
-             "advertised": [{"layer": "edge", "node": "robot-1", "service": "imu-driver", "instance": "0"}],
-             "requested": [{"layer": "fog", "node": "fog-1", "service": "dashboard", "max_rate_hz": 10},
+             "advertised": [{
+                 "layer": "edge",
+                 "node": "robot-1",
+                 "service": "imu-driver",
+                 "instance": "0",
+             }],
+             "requested": [{"layer": "fog", "node": "fog-1", "service": "dashboard",
+                 "max_rate_hz": 10},
                            {"layer": "cloud", "node": "", "service": "recorder"}]},
             {"topic": "odom", "state": "no_request", "rate_hz": null}]});
         assert_eq!(

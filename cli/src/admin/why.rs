@@ -50,26 +50,20 @@ pub(super) fn text(why: &Why) -> String {
     };
     let mut text = match why.verdict {
         Verdict::Flowing => format!("{}{to} is flowing\n", why.topic),
-        Verdict::Degraded => format!("{}{to} is flowing, but not as asked ({})\n", why.topic, why.code),
+        Verdict::Degraded => {
+            format!("{}{to} is flowing, but not as asked ({})\n", why.topic, why.code)
+        }
         Verdict::NotFlowing => format!("{}{to} is NOT flowing ({})\n", why.topic, why.code),
     };
     let width = |part: fn(&Step) -> &str| {
-        why.steps
-            .iter()
-            .map(|step| part(step).chars().count())
-            .max()
-            .unwrap_or(0)
+        why.steps.iter().map(|step| part(step).chars().count()).max().unwrap_or(0)
     };
     let (step_width, flow_width) = (width(|step| &step.step), width(|step| &step.flow));
     for step in &why.steps {
         let mark = if step.ok { "ok  " } else { "FAIL" };
         let mut line = format!("  {mark} {:step_width$}  {:flow_width$}", step.step, step.flow);
         let code = Some(step.code.as_str()).filter(|code| *code != "ok");
-        for part in code
-            .into_iter()
-            .chain(step.detail.as_deref())
-            .filter(|part| !part.is_empty())
-        {
+        for part in code.into_iter().chain(step.detail.as_deref()).filter(|part| !part.is_empty()) {
             line.push_str("  ");
             line.push_str(part);
         }
@@ -93,12 +87,18 @@ mod tests {
 
     #[test]
     fn a_failure_shows_where_and_what_to_do() {
-        let why = parse(
-            json!({"topic": "imu/data", "to": "cloud", "verdict": "not_flowing", "code": "no_request",
+        let why = parse(json!({"topic": "imu/data", "to": "cloud", "verdict": "not_flowing",
+                "code": "no_request",
             "remedy": "Start a service that requests imu/data in cloud.", "steps": [
-                {"flow": "edge/robot-1", "step": "advertise", "ok": true, "code": "ok", "detail": "imu-driver, 50 Hz"},
-                {"flow": "cloud/cloud-1", "step": "request", "ok": false, "code": "no_request", "detail": ""}]}),
-        );
+                {
+                    "flow": "edge/robot-1",
+                    "step": "advertise",
+                    "ok": true,
+                    "code": "ok",
+                    "detail": "imu-driver, 50 Hz",
+                },
+                {"flow": "cloud/cloud-1", "step": "request", "ok": false, "code": "no_request",
+                    "detail": ""}]}));
         assert!(!why.flows());
         assert_eq!(
             text(&why),
@@ -111,9 +111,14 @@ mod tests {
 
     #[test]
     fn degraded_counts_as_flowing() {
-        let why = parse(
-            json!({"topic": "a", "to": null, "verdict": "degraded", "code": "rate_limited", "remedy": null, "steps": []}),
-        );
+        let why = parse(json!({
+            "topic": "a",
+            "to": null,
+            "verdict": "degraded",
+            "code": "rate_limited",
+            "remedy": null,
+            "steps": [],
+        }));
         assert!(why.flows());
         assert_eq!(text(&why), "a is flowing, but not as asked (rate_limited)\n");
     }

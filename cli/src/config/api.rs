@@ -1,4 +1,5 @@
-//! What the commands ask of the main service: pages joined, documents by name, changes with preconditions.
+//! What the commands ask of the main service: pages joined, documents by name, changes with
+//! preconditions.
 
 use blaze_domain::config::{Key, Kind};
 use blaze_domain::{LayerName, NodeName, ServiceName};
@@ -49,7 +50,11 @@ pub(crate) struct Listing {
 impl Listing {
     /// As one page of the API.
     pub(crate) fn into_json(self) -> Value {
-        json!({ "items": self.items, "revision": self.revision, "next_page_token": self.next_page_token })
+        json!({
+            "items": self.items,
+            "revision": self.revision,
+            "next_page_token": self.next_page_token,
+        })
     }
 
     /// Whether a limit ended it.
@@ -72,8 +77,8 @@ impl Client {
         self.pages(&call, filter.limit).await
     }
 
-    /// All pages of a listing, or as many entries as are wanted. It begins anew when what its first page reflected is
-    /// trimmed in between.
+    /// All pages of a listing, or as many entries as are wanted. It begins anew when what its first
+    /// page reflected is trimmed in between.
     ///
     /// # Errors
     /// As [`Self::send`], and [`CliError::Foreign`] for pages that do not end.
@@ -81,7 +86,9 @@ impl Client {
         let mut beginnings = 1;
         loop {
             match self.pages_once(call, limit).await {
-                Err(CliError::Problem(refusal)) if refusal.status == 410 && beginnings < MAX_BEGINNINGS => {
+                Err(CliError::Problem(refusal))
+                    if refusal.status == 410 && beginnings < MAX_BEGINNINGS =>
+                {
                     beginnings += 1;
                 }
                 other => return other,
@@ -104,7 +111,8 @@ impl Client {
             let items = answer.body.get_mut("items").and_then(Value::as_array_mut);
             let items = items.ok_or_else(|| self.odd("a list has no `items`"))?;
             listing.items.append(items);
-            listing.revision = answer.body.get("revision").and_then(Value::as_u64).or(answer.revision);
+            listing.revision =
+                answer.body.get("revision").and_then(Value::as_u64).or(answer.revision);
             let next = answer.body.get("next_page_token").and_then(Value::as_str);
             let next = next.unwrap_or_default();
             let repeated = !next.is_empty() && next == listing.next_page_token;
@@ -120,11 +128,16 @@ impl Client {
         Err(self.odd("the pages of a list do not end"))
     }
 
-    /// One document, with its entity tag. Where there is none of that name, the error says which may have been meant.
+    /// One document, with its entity tag. Where there is none of that name, the error says which
+    /// may have been meant.
     ///
     /// # Errors
     /// As [`Self::send`].
-    pub(crate) async fn document(&self, key: &Key, revision: Option<u64>) -> Result<Answer, CliError> {
+    pub(crate) async fn document(
+        &self,
+        key: &Key,
+        revision: Option<u64>,
+    ) -> Result<Answer, CliError> {
         self.read_document(key, revision, false).await
     }
 
@@ -156,7 +169,8 @@ impl Client {
         }
     }
 
-    /// The value of `If-Match` for a change of a document: that it is as it was read, or, with `force`, that it exists.
+    /// The value of `If-Match` for a change of a document: that it is as it was read, or, with
+    /// `force`, that it exists.
     ///
     /// # Errors
     /// As [`Self::document`].
@@ -202,7 +216,9 @@ impl Client {
 
     async fn with_suggestion(&self, refusal: Refusal, key: &Key) -> CliError {
         let told = refusal.problem.get("detail").and_then(Value::as_str);
-        let meant = if refusal.code() == "not_found" && !told.is_some_and(|detail| detail.contains("did you mean")) {
+        let meant = if refusal.code() == "not_found"
+            && !told.is_some_and(|detail| detail.contains("did you mean"))
+        {
             self.meant(key).await
         } else {
             None
@@ -213,7 +229,8 @@ impl Client {
         }))
     }
 
-    /// The document whose name is most like one that does not exist. What goes wrong here is no reason to say anything else.
+    /// The document whose name is most like one that does not exist. What goes wrong here is no
+    /// reason to say anything else.
     async fn meant(&self, key: &Key) -> Option<String> {
         if let Some(service) = key.service_name() {
             let siblings = self.names(Kind::Instance, Some(service)).await;
@@ -231,9 +248,7 @@ impl Client {
     async fn names(&self, kind: Kind, service: Option<&ServiceName>) -> Vec<String> {
         let call = Call::get(collection_path(kind, service)).query("limit", PAGE.to_string());
         let body = self.send(&call).await.map_or(Value::Null, |answer| answer.body);
-        let names = list(&body, "items")
-            .iter()
-            .filter_map(|item| item.get("name")?.as_str());
+        let names = list(&body, "items").iter().filter_map(|item| item.get("name")?.as_str());
         names.map(str::to_owned).collect()
     }
 
@@ -248,10 +263,7 @@ impl Client {
 
     /// An answer that is not as the contract says.
     pub(crate) fn odd(&self, reason: impl Into<String>) -> CliError {
-        CliError::Foreign {
-            server: self.server().to_owned(),
-            reason: reason.into(),
-        }
+        CliError::Foreign { server: self.server().to_owned(), reason: reason.into() }
     }
 }
 
@@ -260,7 +272,8 @@ fn nearest<'a>(wanted: &str, names: &'a [String]) -> Option<&'a str> {
 }
 
 /// The members that the server sets.
-const SERVER_MEMBERS: [&str; 6] = ["uid", "revision", "create_time", "update_time", "updated_by", "status"];
+const SERVER_MEMBERS: [&str; 6] =
+    ["uid", "revision", "create_time", "update_time", "updated_by", "status"];
 
 /// A document without the members that the server sets: what can be applied again.
 pub(crate) fn clean(mut document: Value) -> Value {

@@ -3,7 +3,8 @@ use crate::config::kinds::parse_key;
 use crate::config::stub::{Reply, Stub};
 
 fn page(names: &[&str], next: &str) -> Value {
-    let items: Vec<Value> = names.iter().map(|name| json!({"kind": "Node", "name": name})).collect();
+    let items: Vec<Value> =
+        names.iter().map(|name| json!({"kind": "Node", "name": name})).collect();
     json!({"items": items, "revision": 412, "next_page_token": next})
 }
 
@@ -21,10 +22,7 @@ async fn pages_are_joined() {
         })
     })
     .await;
-    let filter = Filter {
-        selector: Some("site=lab".to_owned()),
-        ..Filter::default()
-    };
+    let filter = Filter { selector: Some("site=lab".to_owned()), ..Filter::default() };
     let listing = stub.client().list(Kind::Node, &filter).await.unwrap();
     assert_eq!(names(&listing), ["a", "b", "c", "d"]);
     assert_eq!(
@@ -36,19 +34,13 @@ async fn pages_are_joined() {
         ]
     );
     let joined = listing.into_json();
-    assert_eq!(
-        (&joined["revision"], &joined["next_page_token"]),
-        (&json!(412), &json!(""))
-    );
+    assert_eq!((&joined["revision"], &joined["next_page_token"]), (&json!(412), &json!("")));
 }
 
 #[tokio::test]
 async fn a_limit_ends_a_list_and_says_that_there_is_more() {
     let stub = Stub::start(|_, _| Reply::json(&page(&["a", "b"], "t1"))).await;
-    let filter = Filter {
-        limit: Some(2),
-        ..Filter::default()
-    };
+    let filter = Filter { limit: Some(2), ..Filter::default() };
     let listing = stub.client().list(Kind::Node, &filter).await.unwrap();
     assert!(listing.is_cut());
     assert_eq!(stub.lines(), ["GET /api/v1/nodes?limit=2"]);
@@ -114,7 +106,8 @@ async fn changes_insist_on_what_was_read() {
 
 #[test]
 fn a_clean_document_keeps_its_order() {
-    let document = json!({"kind": "Node", "name": "a", "labels": {}, "annotations": {}, "spec": {"layer": "edge"}, "uid": "u",
+    let document = json!({"kind": "Node", "name": "a", "labels": {}, "annotations": {},
+        "spec": {"layer": "edge"}, "uid": "u",
         "revision": 3, "create_time": "t", "update_time": "t", "updated_by": "s"});
     assert_eq!(
         clean(document).to_string(),
@@ -129,10 +122,7 @@ async fn secrets_are_revealed_on_demand_alone() {
     let key = parse_key(Kind::Service, "slam").unwrap();
     client.document(&key, None).await.unwrap();
     client.read_document(&key, Some(4), true).await.unwrap();
-    let filter = Filter {
-        reveal: true,
-        ..Filter::default()
-    };
+    let filter = Filter { reveal: true, ..Filter::default() };
     client.list(Kind::Service, &filter).await.unwrap();
     assert_eq!(
         stub.lines(),

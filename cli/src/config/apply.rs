@@ -25,7 +25,8 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 /// Options of `blaze apply`.
 #[derive(Debug, Args)]
 pub struct ApplyOptions {
-    /// File, directory (its *.yaml, *.yml and *.json) or - for standard input; may be repeated. All go in one request
+    /// File, directory (its *.yaml, *.yml and *.json) or - for standard input; may be repeated. All
+    /// go in one request
     #[arg(short = 'f', long = "file", value_name = "FILE|DIR|-", required = true)]
     pub files: Vec<PathBuf>,
     /// Only say what would happen
@@ -37,7 +38,8 @@ pub struct ApplyOptions {
     /// How many documents --prune deletes; needed for more than 20
     #[arg(long, value_name = "COUNT", requires = "prune")]
     pub prune_confirm: Option<u64>,
-    /// Wait so long (30s, 5m) until every connected worker of the layers concerned has the revision; else exit with 1
+    /// Wait so long (30s, 5m) until every connected worker of the layers concerned has the
+    /// revision; else exit with 1
     #[arg(long, value_name = "DURATION", value_parser = parse_duration, conflicts_with = "dry_run")]
     pub wait: Option<Duration>,
     /// Which server.
@@ -78,7 +80,11 @@ pub(super) struct Request<'a> {
 ///
 /// # Errors
 /// [`CliError`].
-pub(super) async fn send(client: &Client, sources: &[Source], request: &Request<'_>) -> Result<Value, CliError> {
+pub(super) async fn send(
+    client: &Client,
+    sources: &[Source],
+    request: &Request<'_>,
+) -> Result<Value, CliError> {
     if sources.is_empty() {
         return Err(CliError::Usage("the files hold no documents".to_owned()));
     }
@@ -99,7 +105,11 @@ pub(super) async fn send(client: &Client, sources: &[Source], request: &Request<
 ///
 /// # Errors
 /// [`CliError`].
-pub(super) async fn send_array(client: &Client, body: &Value, request: &Request<'_>) -> Result<Value, CliError> {
+pub(super) async fn send_array(
+    client: &Client,
+    body: &Value,
+    request: &Request<'_>,
+) -> Result<Value, CliError> {
     let bytes = body.to_string().len();
     if bytes > MAX_BYTES {
         return Err(CliError::Invalid(format!(
@@ -144,9 +154,7 @@ pub(super) fn table(answer: &Value) -> String {
             ("DOCUMENT", Align::Left, &result_name),
             ("ACTION", Align::Left, &|result| member(result, "action")),
             ("REVISION", Align::Right, &|result| cell(result.get("revision"))),
-            ("CHANGES", Align::Right, &|result| {
-                list(result, "changes").len().to_string()
-            }),
+            ("CHANGES", Align::Right, &|result| list(result, "changes").len().to_string()),
         ],
     )
 }
@@ -155,19 +163,13 @@ pub(super) fn table(answer: &Value) -> String {
 pub(super) fn summary(answer: &Value) -> String {
     let mut parts = Vec::new();
     for action in ["created", "updated", "deleted", "unchanged"] {
-        let number = results(answer)
-            .iter()
-            .filter(|result| member(result, "action") == action)
-            .count();
+        let number =
+            results(answer).iter().filter(|result| member(result, "action") == action).count();
         if number > 0 {
             parts.push(format!("{number} {action}"));
         }
     }
-    let begin = if flag(answer, "dry_run") {
-        "nothing was written; it would be: "
-    } else {
-        ""
-    };
+    let begin = if flag(answer, "dry_run") { "nothing was written; it would be: " } else { "" };
     let total = usize::try_from(whole(answer, "affected_total")).unwrap_or(usize::MAX);
     let affected = count(total, "configuration");
     format!(
@@ -187,7 +189,8 @@ fn layers(answer: &Value, sources: &[Source]) -> Option<BTreeSet<String>> {
     for place in affected {
         layers.insert(place.get("layer")?.as_str()?.to_owned());
     }
-    // Results stand in the order of the request. A layer and its nodes concern its workers although no service runs there.
+    // Results stand in the order of the request. A layer and its nodes concern its workers although
+    // no service runs there.
     for (index, result) in results(answer).iter().enumerate() {
         if !matches!(member(result, "action").as_str(), "created" | "updated") {
             continue;
@@ -242,9 +245,7 @@ async fn wait(
     longest: Duration,
     format: Format,
 ) -> Result<(), CliError> {
-    let changed = results(answer)
-        .iter()
-        .any(|result| member(result, "action") != "unchanged");
+    let changed = results(answer).iter().any(|result| member(result, "action") != "unchanged");
     let (revision, layers) = match changed {
         true => (answer.get("revision").and_then(Value::as_u64), layers(answer, sources)),
         // What was there already may be on its way yet: whoever waits again waits for the same.
@@ -269,7 +270,9 @@ async fn wait(
                 behind
             }
             // The revision is written; whether the workers have it may show again in a moment.
-            Err(error @ (CliError::NoServer { .. } | CliError::Foreign { .. })) => vec![error.to_string()],
+            Err(error @ (CliError::NoServer { .. } | CliError::Foreign { .. })) => {
+                vec![error.to_string()]
+            }
             Err(CliError::Problem(refusal)) if refusal.status >= 500 => vec![refusal.to_string()],
             Err(error) => {
                 return Err(error.advised(format!(
@@ -300,7 +303,8 @@ fn everywhere(workers: usize, revision: u64) -> String {
 /// Connected workers of some layers.
 fn concerned<'w>(workers: &'w Value, layers: Option<&BTreeSet<String>>) -> Vec<&'w Value> {
     let is_concerned = |worker: &&Value| {
-        flag(worker, "connected") && layers.is_none_or(|layers| layers.contains(&member(worker, "layer")))
+        flag(worker, "connected")
+            && layers.is_none_or(|layers| layers.contains(&member(worker, "layer")))
     };
     list(workers, "items").iter().filter(is_concerned).collect()
 }

@@ -47,7 +47,8 @@ fn every_command_of_the_contract_is_taken() {
         "get nodes --client-cert c",
         "audit --kind node --outcome denied --since 24h --limit 10",
         "token create --subject ops --role operator --role viewer --expires 7d",
-        "token create --subject w --role worker --layer edge --key-file k --alg EdDSA --key-id k1 --issuer i --audience a",
+        "token create --subject w --role worker --layer edge --key-file k --alg EdDSA --key-id k1 \
+         --issuer i --audience a",
         "token list",
         "token revoke 0197",
         "token inspect",

@@ -31,7 +31,10 @@ pub(super) async fn referrers(client: &Client, roots: &[Key]) -> Result<Vec<Key>
     let mut documents = Vec::new();
     for kind in kinds_above(roots) {
         for document in client.list(kind, &Filter::default()).await?.items {
-            documents.push(document_of(&document).map_err(|reason| client.odd(format!("a document {reason}")))?);
+            documents.push(
+                document_of(&document)
+                    .map_err(|reason| client.odd(format!("a document {reason}")))?,
+            );
         }
     }
     Ok(closure(roots, &documents))
@@ -116,7 +119,12 @@ mod tests {
     async fn what_refers_to_a_document_is_found_through_others() {
         let stub = Stub::start(|asked: &Asked, _| {
             let rollout = |name: &str, phase: &str, target: Value| {
-                json!({"kind": "Rollout", "name": name, "spec": {"target": target}, "status": {"phase": phase}})
+                json!({
+                    "kind": "Rollout",
+                    "name": name,
+                    "spec": {"target": target},
+                    "status": {"phase": phase},
+                })
             };
             let items = match asked.target.as_str() {
                 "/api/v1/nodes?limit=1000" => json!([
@@ -126,14 +134,28 @@ mod tests {
                     {"kind": "Service", "name": "slam", "spec": {"layers": ["edge", "fog"]}},
                     {"kind": "Service", "name": "log", "spec": {}}]),
                 "/api/v1/services/-/instances?limit=1000" => json!([
-                    {"kind": "Instance", "service": "log", "name": "0", "spec": {"node": "robot-1"}},
+                    {
+                        "kind": "Instance",
+                        "service": "log",
+                        "name": "0",
+                        "spec": {"node": "robot-1"},
+                    },
                     {"kind": "Instance", "service": "log", "name": "1", "spec": {"node": "fog-1"}},
                     {"kind": "Instance", "service": "log", "name": "2", "spec": {"layer": "edge"}},
                     {"kind": "Instance", "service": "slam", "name": "0", "spec": {}}]),
                 "/api/v1/rollouts?limit=1000" => json!([
-                    rollout("active", "canary", json!({"kind": "Instance", "service": "log", "name": "0"})),
-                    rollout("ended", "promoted", json!({"kind": "Instance", "service": "log", "name": "0"})),
-                    rollout("other", "canary", json!({"kind": "Node", "name": "fog-1"}))]),
+                    rollout(
+                        "active",
+                        "canary",
+                        json!({"kind": "Instance", "service": "log", "name": "0"}),
+                    ),
+                    rollout(
+                        "ended",
+                        "promoted",
+                        json!({"kind": "Instance", "service": "log", "name": "0"}),
+                    ),
+                    rollout("other", "canary", json!({"kind": "Node", "name": "fog-1"}))
+                ]),
                 other => panic!("{other}"),
             };
             Reply::json(&json!({"items": items, "revision": 7, "next_page_token": ""}))
@@ -152,9 +174,7 @@ mod tests {
                 "rollout/active"
             ]
         );
-        let found = referrers(&client, &[key("node/fog-1"), key("inst/log/1")])
-            .await
-            .unwrap();
+        let found = referrers(&client, &[key("node/fog-1"), key("inst/log/1")]).await.unwrap();
         assert_eq!(names(&found), ["rollout/other"]);
         let asked = stub.asked().len();
         assert!(referrers(&client, &[key("rollout/active")]).await.unwrap().is_empty());

@@ -1,9 +1,12 @@
-//! HTTP to the main service: deadlines, a largest answer, no redirects, and the token kept to itself.
+//! HTTP to the main service: deadlines, a largest answer, no redirects, and the token kept to
+//! itself.
 
 use std::error::Error as _;
 use std::time::Duration;
 
-use reqwest::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, ETAG, HeaderMap, HeaderName, HeaderValue, IF_MATCH};
+use reqwest::header::{
+    ACCEPT, AUTHORIZATION, CONTENT_TYPE, ETAG, HeaderMap, HeaderName, HeaderValue, IF_MATCH,
+};
 use reqwest::{Certificate, Method, Response};
 use serde_json::Value;
 use tokio::time::timeout;
@@ -21,7 +24,8 @@ const MAX_ANSWER_BYTES: usize = 64 * 1024 * 1024;
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long a request and its answer may take.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
-/// An older connection is not used again: the server may be closing it just then, and a change sent over it would be lost.
+/// An older connection is not used again: the server may be closing it just then, and a change sent
+/// over it would be lost.
 const IDLE: Duration = Duration::from_secs(10);
 /// The store revision that an answer reflects.
 const REVISION: HeaderName = HeaderName::from_static("blaze-revision");
@@ -74,8 +78,8 @@ impl Client {
     /// A client for a server; nothing is sent yet.
     ///
     /// # Errors
-    /// [`CliError::Invalid`] for a bad file of authorities, of a certificate or its key, [`CliError::Failed`] when TLS cannot be
-    /// set up.
+    /// [`CliError::Invalid`] for a bad file of authorities, of a certificate or its key,
+    /// [`CliError::Failed`] when TLS cannot be set up.
     pub(crate) fn new(endpoint: Endpoint) -> Result<Self, CliError> {
         let builder = reqwest::Client::builder()
             .user_agent(concat!("blaze/", env!("CARGO_PKG_VERSION")))
@@ -83,7 +87,8 @@ impl Client {
             // What may be tried again is decided here, not below.
             .retry(reqwest::retry::never())
             .no_proxy()
-            // With HTTP/2, what the server said last of all is lost when it ends a connection: an alert of TLS says why.
+            // With HTTP/2, what the server said last of all is lost when it ends a connection: an
+            // alert of TLS says why.
             .http1_only()
             .connect_timeout(CONNECT_TIMEOUT)
             .pool_idle_timeout(IDLE);
@@ -99,11 +104,13 @@ impl Client {
             None => builder,
         };
         let http = builder.build().map_err(|error| match shown {
-            Some(files) if tls::fault(&error).is_some_and(tls::is_mismatch) => CliError::Invalid(format!(
-                "the client certificate {} and its key {} do not belong together",
-                files.cert_file.display(),
-                files.key_file.as_ref().unwrap_or(&files.cert_file).display()
-            )),
+            Some(files) if tls::fault(&error).is_some_and(tls::is_mismatch) => {
+                CliError::Invalid(format!(
+                    "the client certificate {} and its key {} do not belong together",
+                    files.cert_file.display(),
+                    files.key_file.as_ref().unwrap_or(&files.cert_file).display()
+                ))
+            }
             _ => CliError::Failed(format!("the HTTP client cannot be set up: {}", reason(&error))),
         })?;
         Ok(Self { http, endpoint })
@@ -114,17 +121,21 @@ impl Client {
         self.endpoint.server()
     }
 
-    /// Sends a request and reads its answer. A read is tried again once when the connection breaks; a write never is.
+    /// Sends a request and reads its answer. A read is tried again once when the connection breaks;
+    /// a write never is.
     ///
     /// # Errors
-    /// [`CliError::Problem`] when the server refuses, [`CliError::NoServer`], [`CliError::OutcomeUnknown`] for a write whose
-    /// answer did not come, [`CliError::Foreign`] for what is no JSON or larger than 64 MiB.
+    /// [`CliError::Problem`] when the server refuses, [`CliError::NoServer`],
+    /// [`CliError::OutcomeUnknown`] for a write whose answer did not come, [`CliError::Foreign`]
+    /// for what is no JSON or larger than 64 MiB.
     pub(crate) async fn send(&self, call: &Call) -> Result<Answer, CliError> {
         let token = self.token()?;
         let mut again = call.method == Method::GET;
         loop {
             let fault = match timeout(REQUEST_TIMEOUT, self.exchange(call, token.as_ref())).await {
-                Ok(Ok((status, headers, body))) => return self.judge(status, &headers, &body, token.as_ref()),
+                Ok(Ok((status, headers, body))) => {
+                    return self.judge(status, &headers, &body, token.as_ref());
+                }
                 Ok(Err(fault)) => fault,
                 Err(_) => Fault::Late,
             };
@@ -171,11 +182,19 @@ impl Client {
         self.endpoint.token.as_ref().map(TokenSource::read).transpose()
     }
 
-    fn request(&self, call: &Call, token: Option<&Token>) -> Result<reqwest::RequestBuilder, Fault> {
+    fn request(
+        &self,
+        call: &Call,
+        token: Option<&Token>,
+    ) -> Result<reqwest::RequestBuilder, Fault> {
         let mut request = self.http.request(call.method.clone(), call.url(&self.endpoint.url));
         if let Some(token) = token {
-            let mut value = HeaderValue::from_str(&format!("Bearer {}", token.text()))
-                .map_err(|_| Fault::Before(CliError::Invalid("the token cannot stand in a header".to_owned())))?;
+            let mut value =
+                HeaderValue::from_str(&format!("Bearer {}", token.text())).map_err(|_| {
+                    Fault::Before(CliError::Invalid(
+                        "the token cannot stand in a header".to_owned(),
+                    ))
+                })?;
             value.set_sensitive(true);
             request = request.header(AUTHORIZATION, value);
         }
@@ -191,7 +210,11 @@ impl Client {
         Ok(request)
     }
 
-    async fn exchange(&self, call: &Call, token: Option<&Token>) -> Result<(u16, HeaderMap, Vec<u8>), Fault> {
+    async fn exchange(
+        &self,
+        call: &Call,
+        token: Option<&Token>,
+    ) -> Result<(u16, HeaderMap, Vec<u8>), Fault> {
         let request = self.request(call, token)?;
         let request = request.header(ACCEPT, "application/json, application/problem+json");
         let mut response = request.send().await?;
@@ -199,20 +222,23 @@ impl Client {
         Ok((response.status().as_u16(), response.headers().clone(), body))
     }
 
-    fn judge(&self, status: u16, headers: &HeaderMap, body: &[u8], token: Option<&Token>) -> Result<Answer, CliError> {
+    fn judge(
+        &self,
+        status: u16,
+        headers: &HeaderMap,
+        body: &[u8],
+        token: Option<&Token>,
+    ) -> Result<Answer, CliError> {
         if !(200..300).contains(&status) {
             return Err(self.refused(status, body, token));
         }
         let value = if body.is_empty() {
             Value::Null
         } else {
-            serde_json::from_slice(body).map_err(|error| self.odd(format!("the answer is no JSON: {error}")))?
+            serde_json::from_slice(body)
+                .map_err(|error| self.odd(format!("the answer is no JSON: {error}")))?
         };
-        Ok(Answer {
-            revision: revision(headers),
-            etag: header(headers, &ETAG),
-            body: value,
-        })
+        Ok(Answer { revision: revision(headers), etag: header(headers, &ETAG), body: value })
     }
 
     fn refused(&self, status: u16, body: &[u8], token: Option<&Token>) -> CliError {
@@ -224,9 +250,13 @@ impl Client {
         if status == 401 {
             refusal = refusal.with_hint(match token {
                 None => {
-                    "no token was sent: give --token-file FILE, BLAZE_TOKEN_FILE, BLAZE_TOKEN, or a context that has one"
+                    "no token was sent: give --token-file FILE, BLAZE_TOKEN_FILE, BLAZE_TOKEN, or \
+                     a context that has one"
                 }
-                Some(_) => "the token was not accepted; `blaze token inspect` shows what it says and whether it has run out",
+                Some(_) => {
+                    "the token was not accepted; `blaze token inspect` shows what it says \
+                    and whether it has run out"
+                }
             });
         }
         CliError::Problem(Box::new(refusal))
@@ -249,7 +279,8 @@ impl Client {
                 if advice.is_none() && broke(&error) {
                     advice = tls::broke_off(&self.endpoint);
                 }
-                let before = error.is_connect() || error.is_builder() || of_tls.is_some_and(tls::is_refused);
+                let before =
+                    error.is_connect() || error.is_builder() || of_tls.is_some_and(tls::is_refused);
                 (redact(&reason(&error), token), before)
             }
         };
@@ -265,7 +296,9 @@ impl Client {
             if !unreached && !self.endpoint.is_tls() {
                 "If it speaks TLS, name it with https://.".to_owned()
             } else {
-                "Name the server with --server URL, BLAZE_SERVER or a context (`blaze context list`).".to_owned()
+                "Name the server with --server URL, BLAZE_SERVER or a context (`blaze context \
+                 list`)."
+                    .to_owned()
             }
         });
         CliError::NoServer { server, reason, advice }

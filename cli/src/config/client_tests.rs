@@ -10,19 +10,16 @@ const NODES: &str = "/api/v1/nodes";
 async fn requests_carry_what_they_should() {
     let stub = Stub::start(|_, _| Reply::at(7, &json!({"name": "robot-1"}))).await;
     let client = stub.client_with(Some("abc.def"));
-    let call = Call::get(NODES)
-        .query("label_selector", "a in (b, ü)")
-        .query_if("layer", None::<String>);
+    let call =
+        Call::get(NODES).query("label_selector", "a in (b, ü)").query_if("layer", None::<String>);
     let answer = client.send(&call).await.unwrap();
     assert_eq!((answer.revision, answer.etag.as_deref()), (Some(7), Some("\"7\"")));
     assert_eq!(answer.body["name"], "robot-1");
-    let patch = Call::patch(format!("{NODES}/robot-1"), &json!({"spec": null})).if_match(Some("\"7\"".to_owned()));
+    let patch = Call::patch(format!("{NODES}/robot-1"), &json!({"spec": null}))
+        .if_match(Some("\"7\"".to_owned()));
     client.send(&patch).await.unwrap();
     let asked = stub.asked();
-    assert_eq!(
-        asked[0].line(),
-        "GET /api/v1/nodes?label_selector=a+in+%28b%2C+%C3%BC%29"
-    );
+    assert_eq!(asked[0].line(), "GET /api/v1/nodes?label_selector=a+in+%28b%2C+%C3%BC%29");
     assert_eq!(asked[0].header("authorization"), Some("Bearer abc.def"));
     assert_eq!(asked[0].header("if-match"), None);
     assert_eq!(asked[1].line(), "PATCH /api/v1/nodes/robot-1");
@@ -33,14 +30,9 @@ async fn requests_carry_what_they_should() {
 
 #[tokio::test]
 async fn a_read_is_tried_again_once_and_a_write_never() {
-    let stub = Stub::start(|_, before| {
-        if before == 0 {
-            Reply::Cut
-        } else {
-            Reply::json(&json!({}))
-        }
-    })
-    .await;
+    let stub =
+        Stub::start(|_, before| if before == 0 { Reply::Cut } else { Reply::json(&json!({})) })
+            .await;
     stub.client().send(&Call::get(NODES)).await.unwrap();
     assert_eq!(stub.asked().len(), 2);
 
@@ -83,11 +75,9 @@ async fn refusals_are_problems_and_are_never_tried_again() {
 #[tokio::test]
 async fn nobody_there_means_exit_3_for_writes_too() {
     // Bound and closed again: nobody listens there.
-    let address = std::net::TcpListener::bind("127.0.0.1:0")
-        .unwrap()
-        .local_addr()
-        .unwrap();
-    let client = Client::new(Endpoint::at(parse_server(&format!("http://{address}")).unwrap())).unwrap();
+    let address = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let client =
+        Client::new(Endpoint::at(parse_server(&format!("http://{address}")).unwrap())).unwrap();
     for call in [Call::get(NODES), Call::delete("/api/v1/nodes/a")] {
         let error = client.send(&call).await.unwrap_err();
         assert_eq!(error.exit() as u8, 3, "{error}");
@@ -135,10 +125,7 @@ async fn answers_that_are_no_json_are_told() {
     let error = stub.client().open(&Call::get("/api/v1/watch")).await.unwrap_err();
     assert!(error.to_string().contains("no stream of events"), "{error}");
     let empty = Stub::start(|_, _| Reply::Full(204, Vec::new(), String::new())).await;
-    assert_eq!(
-        empty.client().send(&Call::delete(NODES)).await.unwrap().body,
-        Value::Null
-    );
+    assert_eq!(empty.client().send(&Call::delete(NODES)).await.unwrap().body, Value::Null);
 }
 
 #[test]
@@ -156,8 +143,8 @@ fn authorities_are_read_before_anything_is_sent() {
     assert!(error.to_string().contains("ca.pem"), "{error}");
 }
 
-/// A server of TLS with a certificate for `localhost` and 127.0.0.1, and the file of its authority. With an authority of
-/// clients it takes only those that show a certificate of it.
+/// A server of TLS with a certificate for `localhost` and 127.0.0.1, and the file of its authority.
+/// With an authority of clients it takes only those that show a certificate of it.
 async fn tls_server(
     directory: &std::path::Path,
     clients: Option<rustls::RootCertStore>,
@@ -175,14 +162,15 @@ async fn tls_server(
         .unwrap();
     let builder = match clients {
         Some(roots) => {
-            let verifier = rustls::server::WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider);
+            let verifier = rustls::server::WebPkiClientVerifier::builder_with_provider(
+                Arc::new(roots),
+                provider,
+            );
             builder.with_client_cert_verifier(verifier.build().unwrap())
         }
         None => builder.with_no_client_auth(),
     };
-    let config = builder
-        .with_single_cert(vec![made.cert.der().clone()], key.into())
-        .unwrap();
+    let config = builder.with_single_cert(vec![made.cert.der().clone()], key.into()).unwrap();
     let acceptor = tokio_rustls::TlsAcceptor::from(Arc::new(config));
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("https://{}", listener.local_addr().unwrap());
@@ -194,11 +182,13 @@ async fn tls_server(
                 Ok(mut stream) => {
                     let mut request = [0_u8; 4096];
                     let _ = stream.read(&mut request).await;
-                    let answer = "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-length: 2\r\n\r\n{}";
+                    let answer =
+                        "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-length: 2\r\n\r\n{}";
                     let _ = stream.write_all(answer.as_bytes()).await;
                     let _ = stream.shutdown().await;
                 }
-                // What the client has sent already is read: else the system resets the connection, and the alert may be lost.
+                // What the client has sent already is read: else the system resets the connection,
+                // and the alert may be lost.
                 Err((_, mut stream)) => {
                     let _ = stream.shutdown().await;
                     let _ = tokio::io::copy(&mut stream, &mut tokio::io::sink()).await;
@@ -225,19 +215,13 @@ async fn a_server_may_ask_for_a_certificate() {
         client_certificate,
         ..Endpoint::at(parse_server(&url).unwrap())
     };
-    let shown = ClientCertificate {
-        cert_file: cert_file.clone(),
-        key_file: Some(key_file.clone()),
-    };
+    let shown =
+        ClientCertificate { cert_file: cert_file.clone(), key_file: Some(key_file.clone()) };
     let client = Client::new(endpoint(Some(shown.clone()))).unwrap();
     client.send(&Call::get(NODES)).await.unwrap();
     client.send(&Call::delete("/api/v1/nodes/a")).await.unwrap();
 
-    let error = Client::new(endpoint(None))
-        .unwrap()
-        .send(&Call::get(NODES))
-        .await
-        .unwrap_err();
+    let error = Client::new(endpoint(None)).unwrap().send(&Call::get(NODES)).await.unwrap_err();
     assert_eq!(error.exit() as u8, 3, "{error}");
     let text = error.to_string();
     assert!(text.contains("--client-cert FILE --client-key FILE"), "{text}");
@@ -262,18 +246,12 @@ async fn tls_needs_the_authority_that_signed() {
         };
         Client::new(endpoint).unwrap()
     };
-    client(&url, Some(ca_file.clone()))
-        .send(&Call::get(NODES))
-        .await
-        .unwrap();
+    client(&url, Some(ca_file.clone())).send(&Call::get(NODES)).await.unwrap();
     let other = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
     std::fs::write(&ca_file, other.cert.pem()).unwrap();
     let error = client(&url, Some(ca_file)).send(&Call::get(NODES)).await.unwrap_err();
     assert_eq!(error.exit() as u8, 3, "{error}");
-    assert!(
-        error.to_string().contains("--ca-file FILE names the authority"),
-        "{error}"
-    );
+    assert!(error.to_string().contains("--ca-file FILE names the authority"), "{error}");
     // Spoken to without TLS, it is no such server, and the advice says what may be wrong.
     let plain = client(&url.replace("https", "http"), None);
     let error = plain.send(&Call::get(NODES)).await.unwrap_err();

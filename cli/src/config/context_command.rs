@@ -64,20 +64,17 @@ fn parse_url(text: &str) -> Result<String, String> {
 /// # Errors
 /// [`CliError`].
 pub(super) fn run(command: &ContextCommand, format: Format) -> Result<Exit, CliError> {
-    let file = contexts::default_file()
-        .ok_or_else(|| CliError::Failed("neither XDG_CONFIG_HOME nor HOME says where contexts are kept".to_owned()))?;
+    let file = contexts::default_file().ok_or_else(|| {
+        CliError::Failed("neither XDG_CONFIG_HOME nor HOME says where contexts are kept".to_owned())
+    })?;
     run_with(command, &file, format)
 }
 
 fn run_with(command: &ContextCommand, file: &Path, format: Format) -> Result<Exit, CliError> {
     match command {
         ContextCommand::Add(options) => {
-            let files = [
-                &options.token_file,
-                &options.ca_file,
-                &options.client_cert,
-                &options.client_key,
-            ];
+            let files =
+                [&options.token_file, &options.ca_file, &options.client_cert, &options.client_key];
             for given in files.into_iter().flatten().filter(|file| !file.exists()) {
                 note(format, &format!("{} does not exist yet", given.display()));
             }
@@ -127,7 +124,8 @@ fn run_with(command: &ContextCommand, file: &Path, format: Format) -> Result<Exi
 
 /// Paths are kept as they are from everywhere.
 fn absolute(path: &Path) -> Result<PathBuf, CliError> {
-    std::path::absolute(path).map_err(|error| CliError::Failed(format!("{}: {error}", path.display())))
+    std::path::absolute(path)
+        .map_err(|error| CliError::Failed(format!("{}: {error}", path.display())))
 }
 
 fn must_exist(known: &Contexts, name: &str) -> Result<(), CliError> {
@@ -151,7 +149,8 @@ fn listed(known: &Contexts) -> Value {
         .iter()
         .map(|(name, context)| {
             json!({
-                "name": name, "current": known.current.as_deref() == Some(name), "server": context.server,
+                "name": name, "current": known.current.as_deref() == Some(name),
+                "server": context.server,
                 "token_file": context.token_file, "ca_file": context.ca_file,
                 "client_cert": context.client_cert, "client_key": context.client_key,
             })
@@ -176,9 +175,7 @@ fn table(listed: &Value) -> String {
             ("SERVER", Align::Left, &|context| cell(context.get("server"))),
             ("TOKEN FILE", Align::Left, &|context| cell(context.get("token_file"))),
             ("AUTHORITIES", Align::Left, &|context| cell(context.get("ca_file"))),
-            ("CLIENT CERTIFICATE", Align::Left, &|context| {
-                cell(context.get("client_cert"))
-            }),
+            ("CLIENT CERTIFICATE", Align::Left, &|context| cell(context.get("client_cert"))),
         ],
     )
 }
@@ -222,15 +219,9 @@ mod tests {
             table(&listed(&kept))
         );
         let error = run(&ContextCommand::Use(named("labb"))).unwrap_err();
-        assert!(
-            error.to_string().contains("did you mean lab?\n  `blaze context list`"),
-            "{error}"
-        );
+        assert!(error.to_string().contains("did you mean lab?\n  `blaze context list`"), "{error}");
         let error = run(&ContextCommand::Use(named("zebra"))).unwrap_err();
-        assert!(
-            error.to_string().starts_with("there is no context zebra\n  `blaze"),
-            "{error}"
-        );
+        assert!(error.to_string().starts_with("there is no context zebra\n  `blaze"), "{error}");
         run(&ContextCommand::Remove(named("hall"))).unwrap();
         assert_eq!(current(), None);
         assert_eq!(contexts::load(&file).unwrap().contexts.len(), 1);
@@ -239,10 +230,7 @@ mod tests {
 
     #[test]
     fn urls_are_kept_short() {
-        assert_eq!(
-            parse_url("https://lab.example:8443/").unwrap(),
-            "https://lab.example:8443"
-        );
+        assert_eq!(parse_url("https://lab.example:8443/").unwrap(), "https://lab.example:8443");
         assert!(parse_url("lab.example").is_err());
     }
 }

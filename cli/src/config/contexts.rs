@@ -1,4 +1,5 @@
-//! Contexts: servers that a person works with, by name. They hold paths of token files, never a token.
+//! Contexts: servers that a person works with, by name. They hold paths of token files, never a
+//! token.
 
 use std::collections::BTreeMap;
 use std::fs::{DirBuilder, OpenOptions};
@@ -43,7 +44,8 @@ pub(crate) struct Contexts {
     pub(crate) contexts: BTreeMap<String, Context>,
 }
 
-/// `$XDG_CONFIG_HOME/blaze/config.yaml`, else `~/.config/blaze/config.yaml`; `None` where neither is known.
+/// `$XDG_CONFIG_HOME/blaze/config.yaml`, else `~/.config/blaze/config.yaml`; `None` where neither
+/// is known.
 pub(crate) fn default_file() -> Option<PathBuf> {
     let configured = environment::variable("XDG_CONFIG_HOME").map(PathBuf::from);
     let home = || environment::variable("HOME").map(|home| PathBuf::from(home).join(".config"));
@@ -58,7 +60,8 @@ pub(crate) fn default_file() -> Option<PathBuf> {
 /// [`CliError::Failed`] when it cannot be read, [`CliError::Invalid`] for what stands in it.
 pub(crate) fn load(file: &Path) -> Result<Contexts, CliError> {
     let invalid = |reason: String| CliError::Invalid(format!("{}: {reason}", file.display()));
-    let content = read_small(file).map_err(|error| CliError::Failed(format!("{}: {error}", file.display())))?;
+    let content = read_small(file)
+        .map_err(|error| CliError::Failed(format!("{}: {error}", file.display())))?;
     let Some(content) = content else {
         return Ok(Contexts::default());
     };
@@ -69,11 +72,16 @@ pub(crate) fn load(file: &Path) -> Result<Contexts, CliError> {
     yaml_serde::from_str(text).map_err(|error| invalid(error.to_string()))
 }
 
-/// Changes the file as a whole; two commands at once both take effect. Its mode is 0600, that of a new directory 0700.
+/// Changes the file as a whole; two commands at once both take effect. Its mode is 0600, that of a
+/// new directory 0700.
 ///
 /// # Errors
-/// As [`load`], whatever `change` says, and those of the file system; the old content is then still there.
-pub(crate) fn update<T>(file: &Path, change: impl FnOnce(&mut Contexts) -> Result<T, CliError>) -> Result<T, CliError> {
+/// As [`load`], whatever `change` says, and those of the file system; the old content is then still
+/// there.
+pub(crate) fn update<T>(
+    file: &Path,
+    change: impl FnOnce(&mut Contexts) -> Result<T, CliError>,
+) -> Result<T, CliError> {
     let failed = |error: std::io::Error| CliError::Failed(format!("{}: {error}", file.display()));
     if let Some(directory) = file.parent() {
         let mut builder = DirBuilder::new();
@@ -91,7 +99,8 @@ pub(crate) fn update<T>(file: &Path, change: impl FnOnce(&mut Contexts) -> Resul
     lock.lock().map_err(failed)?;
     let mut contexts = load(file)?;
     let result = change(&mut contexts)?;
-    let text = yaml_serde::to_string(&contexts).map_err(|error| CliError::Failed(error.to_string()))?;
+    let text =
+        yaml_serde::to_string(&contexts).map_err(|error| CliError::Failed(error.to_string()))?;
     write_atomically(file, text.as_bytes()).map_err(failed)?;
     Ok(result)
 }
@@ -103,9 +112,7 @@ pub(crate) fn update<T>(file: &Path, change: impl FnOnce(&mut Contexts) -> Resul
 pub(crate) fn parse_name(text: &str) -> Result<String, String> {
     let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
     if text.is_empty() || text.len() > 63 || !text.chars().all(allowed) {
-        return Err(format!(
-            "{text:?} is no name of a context: 1 to 63 of A-Z a-z 0-9 . _ -"
-        ));
+        return Err(format!("{text:?} is no name of a context: 1 to 63 of A-Z a-z 0-9 . _ -"));
     }
     Ok(text.to_owned())
 }

@@ -26,13 +26,15 @@ const MAX_LISTED: usize = 100;
 #[derive(Debug, Args)]
 pub struct DeleteOptions {
     /// Kind of the document; or KIND/NAME
-    #[arg(value_name = "KIND", value_parser = kinds::parse_target, required_unless_present = "files")]
+    #[arg(value_name = "KIND", value_parser = kinds::parse_target,
+        required_unless_present = "files")]
     pub target: Option<Target>,
     /// Its name; of an instance SERVICE/NAME
     #[arg(value_name = "NAME")]
     pub name: Option<String>,
     /// Delete the documents of these files: file, directory or -; all or none
-    #[arg(short = 'f', long = "file", value_name = "FILE|DIR|-", conflicts_with_all = ["target", "name"])]
+    #[arg(short = 'f', long = "file", value_name = "FILE|DIR|-",
+        conflicts_with_all = ["target", "name"])]
     pub files: Vec<PathBuf>,
     /// Delete also what refers to it
     #[arg(long)]
@@ -55,10 +57,7 @@ pub struct DeleteOptions {
 pub(super) async fn run(options: &DeleteOptions, format: Format) -> Result<Exit, CliError> {
     let keys: Vec<Key> = match &options.target {
         Some(target) => vec![target.key(options.name.as_deref())?],
-        None => files::read(&options.files)?
-            .into_iter()
-            .map(|source| source.key)
-            .collect(),
+        None => files::read(&options.files)?.into_iter().map(|source| source.key).collect(),
     };
     if keys.is_empty() {
         return Err(CliError::Usage("the files hold no documents".to_owned()));
@@ -67,11 +66,8 @@ pub(super) async fn run(options: &DeleteOptions, format: Format) -> Result<Exit,
     let client = Client::of(&options.server)?;
     let found = look(&client, &keys).await?;
     if !options.yes {
-        let along = if options.cascade {
-            cascade::referrers(&client, &keys).await?
-        } else {
-            Vec::new()
-        };
+        let along =
+            if options.cascade { cascade::referrers(&client, &keys).await? } else { Vec::new() };
         if !confirmed(&question(&keys, &along))? {
             return Err(CliError::Failed("nothing was deleted".to_owned()));
         }
@@ -82,16 +78,14 @@ pub(super) async fn run(options: &DeleteOptions, format: Format) -> Result<Exit,
     // What is deleted is told, also when the next one was refused.
     if !gone.keys.is_empty() {
         let complete = !options.cascade || gone.take_along(&client, format).await;
-        let deleted: Vec<Value> = gone.keys.iter().map(|key| Value::Object(reference(key))).collect();
+        let deleted: Vec<Value> =
+            gone.keys.iter().map(|key| Value::Object(reference(key))).collect();
         let mut told = json!({ "deleted": deleted });
         if !complete {
             told["incomplete"] = true.into();
         }
         print(&told, format, |_| {
-            gone.keys
-                .iter()
-                .map(|key| format!("{} deleted\n", name_of(key)))
-                .collect()
+            gone.keys.iter().map(|key| format!("{} deleted\n", name_of(key))).collect()
         })?;
     }
     ended.map(|()| Exit::Done)
@@ -107,7 +101,8 @@ struct Gone {
 }
 
 impl Gone {
-    /// Adds what the deletions took along: the server tells it in the commits alone. Whether they could be read.
+    /// Adds what the deletions took along: the server tells it in the commits alone. Whether they
+    /// could be read.
     async fn take_along(&mut self, client: &Client, format: Format) -> bool {
         match cascade::deleted(client, &self.revisions).await {
             Some(along) => {
@@ -117,7 +112,9 @@ impl Gone {
             }
             None => {
                 let since = self.revisions.first().map(|first| first.saturating_sub(1));
-                let how = since.map_or_else(String::new, |since| format!(": `blaze watch --since {since}` shows it"));
+                let how = since.map_or_else(String::new, |since| {
+                    format!(": `blaze watch --since {since}` shows it")
+                });
                 note(format, &format!("what was deleted with it could not be read{how}"));
                 false
             }
@@ -144,7 +141,8 @@ async fn delete(
     gone: &mut Gone,
 ) -> Result<(), CliError> {
     if several && !cascade {
-        let documents: Value = found.iter().map(|(key, answer)| deletion(key, answer, force)).collect();
+        let documents: Value =
+            found.iter().map(|(key, answer)| deletion(key, answer, force)).collect();
         send_array(client, &documents, &Request::default()).await?;
         gone.keys.extend(found.iter().map(|(key, _)| key.clone()));
         return Ok(());
@@ -157,7 +155,9 @@ async fn delete(
             Ok(answer) => gone.revisions.extend(answer.revision),
             // What stood before it has taken it along; it existed when all was read.
             Err(CliError::Problem(refusal)) if index > 0 && refusal.code() == "not_found" => {}
-            Err(error) => return Err(error.hinted("in_use", "--cascade deletes what refers to it, too")),
+            Err(error) => {
+                return Err(error.hinted("in_use", "--cascade deletes what refers to it, too"));
+            }
         }
         gone.keys.push(key.clone());
     }
@@ -187,11 +187,8 @@ fn reference(key: &Key) -> Map<String, Value> {
 /// What is asked. All that would go with it stands there, up to a number that can be read.
 fn question(keys: &[Key], along: &[Key]) -> String {
     let listed = |keys: &[Key]| {
-        let mut text: String = keys
-            .iter()
-            .take(MAX_LISTED)
-            .map(|key| format!("  {}\n", name_of(key)))
-            .collect();
+        let mut text: String =
+            keys.iter().take(MAX_LISTED).map(|key| format!("  {}\n", name_of(key))).collect();
         if keys.len() > MAX_LISTED {
             text.push_str(&format!("  and {} more\n", keys.len() - MAX_LISTED));
         }
@@ -203,11 +200,8 @@ fn question(keys: &[Key], along: &[Key]) -> String {
         keys => format!("{} would be deleted:\n{}", count(keys.len(), "document"), listed(keys)),
     };
     if !along.is_empty() {
-        let (with, what) = if text.ends_with('\n') {
-            ("With them", "them")
-        } else {
-            (", and with it", "it")
-        };
+        let (with, what) =
+            if text.ends_with('\n') { ("With them", "them") } else { (", and with it", "it") };
         let number = count(along.len(), "document");
         text.push_str(&format!("{with} what refers to {what}, {number}:\n{}", listed(along)));
     }
@@ -221,10 +215,7 @@ mod tests {
     use crate::config::stub::{Asked, Reply, Stub};
 
     fn keys(names: &[&str]) -> Vec<Key> {
-        names
-            .iter()
-            .map(|name| kinds::parse_target(name).unwrap().key(None).unwrap())
-            .collect()
+        names.iter().map(|name| kinds::parse_target(name).unwrap().key(None).unwrap()).collect()
     }
 
     async fn stub() -> Stub {
@@ -269,16 +260,20 @@ mod tests {
             last.json(),
             json!([
                 {"kind": "Node", "name": "a", "delete": true, "revision": 412},
-                {"kind": "Instance", "name": "0", "service": "slam", "delete": true, "revision": 412},
+                {
+                    "kind": "Instance",
+                    "name": "0",
+                    "service": "slam",
+                    "delete": true,
+                    "revision": 412,
+                },
             ])
         );
         let error = look(&client, &keys(&["node/a", "node/gone"])).await.unwrap_err();
         assert_eq!(error.exit() as u8, 4);
         // With cascade the second may be gone by then.
         let found = look(&client, &keys(&["node/a", "node/taken"])).await.unwrap();
-        delete(&client, &found, true, false, true, &mut Gone::default())
-            .await
-            .unwrap();
+        delete(&client, &found, true, false, true, &mut Gone::default()).await.unwrap();
         let found = look(&client, &keys(&["node/a", "node/used"])).await.unwrap();
         let mut gone = Gone::default();
         let error = delete(&client, &found, true, false, true, &mut gone).await.unwrap_err();
@@ -302,14 +297,12 @@ mod tests {
             "2 documents would be deleted:\n  node/a\n  layer/edge\nDelete all 2?"
         );
         assert!(
-            question(&two, &keys(&["ro/a"])).contains("\nWith them what refers to them, 1 document:\n  rollout/a\n")
+            question(&two, &keys(&["ro/a"]))
+                .contains("\nWith them what refers to them, 1 document:\n  rollout/a\n")
         );
         let many: Vec<Key> = (0..MAX_LISTED + 3)
             .map(|number| {
-                kinds::parse_target(&format!("node/n{number}"))
-                    .unwrap()
-                    .key(None)
-                    .unwrap()
+                kinds::parse_target(&format!("node/n{number}")).unwrap().key(None).unwrap()
             })
             .collect();
         assert!(question(&one, &many).ends_with("  node/n99\n  and 3 more\nDelete all 104?"));
@@ -325,10 +318,7 @@ mod tests {
             Reply::Events(format!("retry: 1\nid: 413\nevent: change\ndata: {data}\n\n"))
         })
         .await;
-        let mut gone = Gone {
-            keys: keys(&["node/a"]),
-            revisions: BTreeSet::from([413]),
-        };
+        let mut gone = Gone { keys: keys(&["node/a"]), revisions: BTreeSet::from([413]) };
         assert!(gone.take_along(&stub.client(), Format::Json).await);
         assert_eq!(gone.keys, keys(&["node/a", "node/b"]));
         gone.revisions.clear();

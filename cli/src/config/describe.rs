@@ -41,8 +41,8 @@ pub(super) async fn run(options: &DescribeOptions, format: Format) -> Result<Exi
     print(&description, format, |description| text(&key, description, now_ms()))
 }
 
-/// Everything about one document: `document`, `effective` (`null` for a roll-out), `workers` that it concerns with
-/// `applied`, and the last changes as `history`.
+/// Everything about one document: `document`, `effective` (`null` for a roll-out), `workers` that
+/// it concerns with `applied`, and the last changes as `history`.
 async fn describe(client: &Client, key: &Key) -> Result<Value, CliError> {
     let document = client.document(key, None).await?.body;
     let call = Call::get(format!("{}/history", document_path(key)));
@@ -76,13 +76,21 @@ fn effective_call(key: &Key) -> Option<Call> {
         (Kind::Layer, _) => Some(call.query("layer", name)),
         (Kind::Node, _) => Some(call.query("node", name)),
         (Kind::Service, _) => Some(call.query("service", name)),
-        (Kind::Instance, Some(service)) => Some(call.query("service", service.as_str()).query("instance", name)),
+        (Kind::Instance, Some(service)) => {
+            Some(call.query("service", service.as_str()).query("instance", name))
+        }
         (Kind::Instance, None) | (Kind::Rollout, _) => None,
     }
 }
 
-/// The workers of the layers that a document concerns, each with whether it has the document as it is now.
-fn concerned(key: &Key, document: &Value, effective: Option<&Value>, workers: &Value) -> Vec<Value> {
+/// The workers of the layers that a document concerns, each with whether it has the document as it
+/// is now.
+fn concerned(
+    key: &Key,
+    document: &Value,
+    effective: Option<&Value>,
+    workers: &Value,
+) -> Vec<Value> {
     let revision = whole(document, "revision");
     let text = |pointer: &str| document.pointer(pointer).and_then(Value::as_str);
     let one: Option<&str> = match key.kind() {
@@ -144,7 +152,8 @@ fn text(key: &Key, description: &Value, now_ms: i64) -> String {
 }
 
 fn workers_table(workers: &[Value], width: Option<u16>) -> String {
-    let yes = |worker: &Value, name: &str| (if flag(worker, name) { "yes" } else { "no" }).to_owned();
+    let yes =
+        |worker: &Value, name: &str| (if flag(worker, name) { "yes" } else { "no" }).to_owned();
     output::table(
         workers,
         width,
@@ -166,8 +175,10 @@ mod tests {
     use crate::config::stub::{Asked, Reply, Stub};
 
     fn node() -> Value {
-        json!({"kind": "Node", "name": "robot-1", "labels": {}, "annotations": {}, "spec": {"layer": "edge"}, "uid": "u",
-            "revision": 412, "create_time": "2026-11-21T06:01:12.345Z", "update_time": "2026-11-21T07:00:12.345Z",
+        json!({"kind": "Node", "name": "robot-1", "labels": {}, "annotations": {},
+            "spec": {"layer": "edge"}, "uid": "u",
+            "revision": 412, "create_time": "2026-11-21T06:01:12.345Z",
+            "update_time": "2026-11-21T07:00:12.345Z",
             "updated_by": "ops"})
     }
 
@@ -179,9 +190,9 @@ mod tests {
                 Reply::json(&json!({"items": [{"revision": 412, "op": "update"}],
                 "revision": 412, "next_page_token": ""}))
             }
-            "/api/v1/effective?node=robot-1" => {
-                Reply::json(&json!({"layer": "edge", "node": "robot-1", "revision": 412, "config": {}}))
-            }
+            "/api/v1/effective?node=robot-1" => Reply::json(
+                &json!({"layer": "edge", "node": "robot-1", "revision": 412, "config": {}}),
+            ),
             "/api/v1/workers" => Reply::json(&json!({"items": [
                 {"layer": "edge", "node": "robot-1", "connected": true, "revision": 412},
                 {"layer": "edge", "node": "robot-2", "connected": true, "revision": 411},
@@ -191,12 +202,8 @@ mod tests {
         .await;
         let key = parse_key(Kind::Node, "robot-1").unwrap();
         let description = describe(&stub.client(), &key).await.unwrap();
-        let applied: Vec<&Value> = description["workers"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .map(|w| &w["applied"])
-            .collect();
+        let applied: Vec<&Value> =
+            description["workers"].as_array().unwrap().iter().map(|w| &w["applied"]).collect();
         assert_eq!(applied, [&json!(true), &json!(false)]);
         let text = text(&key, &description, 1_795_244_472_345);
         for part in [
@@ -214,7 +221,9 @@ mod tests {
     async fn what_a_token_may_not_see_is_left_out() {
         let stub = Stub::start(|asked: &Asked, _| match asked.target.as_str() {
             "/api/v1/nodes/robot-1" => Reply::json(&node()),
-            target if target.contains("history") => Reply::json(&json!({"items": [], "next_page_token": ""})),
+            target if target.contains("history") => {
+                Reply::json(&json!({"items": [], "next_page_token": ""}))
+            }
             _ => Reply::problem(403, "permission_denied", "no"),
         })
         .await;

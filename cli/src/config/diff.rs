@@ -27,7 +27,8 @@ pub struct DiffOptions {
     )]
     pub files: Vec<PathBuf>,
     /// Kind of a document whose revisions are compared; or KIND/NAME
-    #[arg(value_name = "KIND", value_parser = kinds::parse_target, required_unless_present = "files")]
+    #[arg(value_name = "KIND", value_parser = kinds::parse_target,
+        required_unless_present = "files")]
     pub target: Option<Target>,
     /// Its name; of an instance SERVICE/NAME
     #[arg(value_name = "NAME")]
@@ -76,10 +77,7 @@ async fn compare(options: &DiffOptions, format: Format) -> Result<Exit, CliError
         _ => {
             let sources = without_revisions(files::read(&options.files)?);
             let client = Client::of(&options.server)?;
-            let request = Request {
-                dry_run: true,
-                ..Request::default()
-            };
+            let request = Request { dry_run: true, ..Request::default() };
             let answer = apply::send(&client, &sources, &request).await?;
             let differs = has_differences(&answer);
             if differs || format != Format::Table {
@@ -94,8 +92,8 @@ async fn compare(options: &DiffOptions, format: Format) -> Result<Exit, CliError
     Ok(if differs { Exit::Failed } else { Exit::Done })
 }
 
-/// `revision` in a file is the precondition of a change, and here nothing is changed: what others wrote in between is to be
-/// shown, not refused.
+/// `revision` in a file is the precondition of a change, and here nothing is changed: what others
+/// wrote in between is to be shown, not refused.
 fn without_revisions(mut sources: Vec<Source>) -> Vec<Source> {
     for source in &mut sources {
         if let Value::Object(members) = &mut source.value {
@@ -106,9 +104,7 @@ fn without_revisions(mut sources: Vec<Source>) -> Vec<Source> {
 }
 
 fn has_differences(answer: &Value) -> bool {
-    apply::results(answer)
-        .iter()
-        .any(|result| member(result, "action") != "unchanged")
+    apply::results(answer).iter().any(|result| member(result, "action") != "unchanged")
 }
 
 /// Documents that differ, each with what does.
@@ -174,7 +170,13 @@ mod tests {
                 {"op": "replace", "path": "/spec/type", "old": "static", "value": "mobile"},
                 {"op": "add", "path": "/labels/site", "value": "lab"},
                 {"op": "remove", "path": "/spec/config/a", "old": null}]},
-            {"kind": "Instance", "service": "slam", "name": "0", "action": "deleted", "changes": []},
+            {
+                "kind": "Instance",
+                "service": "slam",
+                "name": "0",
+                "action": "deleted",
+                "changes": [],
+            },
             {"kind": "Layer", "name": "edge", "action": "unchanged", "changes": []}]});
         assert!(has_differences(&answer));
         assert_eq!(

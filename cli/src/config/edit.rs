@@ -45,7 +45,8 @@ pub struct EditOptions {
 /// Edits.
 ///
 /// # Errors
-/// [`CliError`]; from the moment on at which the editor was left, it names the file that holds what was written.
+/// [`CliError`]; from the moment on at which the editor was left, it names the file that holds what
+/// was written.
 pub(super) async fn run(options: &EditOptions, format: Format) -> Result<Exit, CliError> {
     let key = options.document.key()?;
     let client = Client::of(&options.server)?;
@@ -96,7 +97,8 @@ async fn edit(
     }
 }
 
-/// What is edited, and the text of the file. Without `force` it has the revision, which fences what is applied later.
+/// What is edited, and the text of the file. Without `force` it has the revision, which fences what
+/// is applied later.
 fn shown(key: &Key, document: Value, force: bool) -> (Value, String) {
     let revision = document.get("revision").filter(|_| !force).cloned();
     let before = clean(document);
@@ -114,13 +116,12 @@ fn shown(key: &Key, document: Value, force: bool) -> (Value, String) {
 }
 
 fn new_file(directory: &Path, key: &Key, text: &str) -> Result<PathBuf, CliError> {
-    let failed = |error: std::io::Error| CliError::Failed(format!("a file in {}: {error}", directory.display()));
+    let failed = |error: std::io::Error| {
+        CliError::Failed(format!("a file in {}: {error}", directory.display()))
+    };
     let name = format!("blaze-{}-", name_of(key).replace('/', "-"));
     // Its mode is 0600.
-    let made = tempfile::Builder::new()
-        .prefix(&name)
-        .suffix(".yaml")
-        .tempfile_in(directory);
+    let made = tempfile::Builder::new().prefix(&name).suffix(".yaml").tempfile_in(directory);
     let mut file = made.map_err(failed)?;
     file.write_all(text.as_bytes()).map_err(failed)?;
     let (_, path) = file.keep().map_err(|error| failed(error.error))?;
@@ -137,13 +138,13 @@ async fn launch(editor: &str, file: &Path) -> Result<(), CliError> {
         .stdin(Stdio::inherit())
         .status()
         .await
-        .map_err(|error| CliError::Failed(format!("the editor {editor} does not start: {error}")))?;
+        .map_err(|error| {
+            CliError::Failed(format!("the editor {editor} does not start: {error}"))
+        })?;
     if ended.success() {
         Ok(())
     } else {
-        Err(CliError::Failed(format!(
-            "the editor {editor} failed ({ended}); nothing was changed"
-        )))
+        Err(CliError::Failed(format!("the editor {editor} failed ({ended}); nothing was changed")))
     }
 }
 
@@ -172,10 +173,18 @@ fn not_edited(error: CliError, file: &Path, text: &str) -> CliError {
 /// Says where the edited file is and how to go on.
 fn kept(error: CliError, file: &Path, key: &Key) -> CliError {
     let place = file.display();
-    let moved = matches!(&error, CliError::Problem(refusal) if matches!(refusal.code(), "precondition_failed" | "revision_conflict"));
+    let moved = matches!(
+        &error,
+        CliError::Problem(refusal) if matches!(
+            refusal.code(),
+            "precondition_failed" | "revision_conflict",
+        ),
+    );
     let how = match error.exit() {
         _ if moved => format!(
-            "`blaze diff -f {place}` shows how it differs from what is there now. Take that over, set its `revision` to the one of now, and `blaze apply -f {place}`; or `blaze edit {}` anew.",
+            "`blaze diff -f {place}` shows how it differs from what is there now. Take that over, \
+             set its `revision` to the one of now, and `blaze apply -f {place}`; or `blaze edit \
+             {}` anew.",
             name_of(key)
         ),
         Exit::Invalid => format!("Correct it and `blaze apply -f {place}`."),
@@ -194,8 +203,10 @@ mod tests {
     use blaze_domain::config::Kind;
 
     fn node(kind: &str) -> Value {
-        json!({"kind": "Node", "name": "robot-1", "labels": {}, "annotations": {}, "spec": {"layer": "edge", "type": kind},
-            "uid": "u", "revision": 412, "create_time": "t", "update_time": "t", "updated_by": "ops"})
+        json!({"kind": "Node", "name": "robot-1", "labels": {}, "annotations": {},
+            "spec": {"layer": "edge", "type": kind},
+            "uid": "u", "revision": 412, "create_time": "t", "update_time": "t",
+            "updated_by": "ops"})
     }
 
     fn key() -> Key {
@@ -229,7 +240,13 @@ mod tests {
         assert_eq!(put.header("if-match"), Some("\"412\""));
         assert_eq!(
             put.json(),
-            json!({"kind": "Node", "name": "robot-1", "labels": {}, "annotations": {}, "spec": {"layer": "edge", "type": "mobile"}})
+            json!({
+                "kind": "Node",
+                "name": "robot-1",
+                "labels": {},
+                "annotations": {},
+                "spec": {"layer": "edge", "type": "mobile"},
+            })
         );
         assert!(left(directory.path()).is_empty());
     }
@@ -247,15 +264,13 @@ mod tests {
         assert!(left(directory.path()).is_empty());
         // It wrote something and failed then.
         let error = edited("false $(sed -i s/static/mobile/ \"$1\")").await.unwrap_err();
-        assert!(
-            error.to_string().contains("What the editor left behind is in"),
-            "{error}"
-        );
+        assert!(error.to_string().contains("What the editor left behind is in"), "{error}");
         assert_eq!(left(directory.path()).len(), 1);
         assert!(stub.asked().iter().all(|asked| asked.method == "GET"));
     }
 
-    /// The file is fenced by the revision that was read, except for whoever forces a change: he wants no precondition.
+    /// The file is fenced by the revision that was read, except for whoever forces a change: he
+    /// wants no precondition.
     #[tokio::test]
     async fn a_conflict_keeps_the_file_and_says_how_to_go_on() {
         for (force, tag, revision, advice) in [
@@ -264,9 +279,8 @@ mod tests {
         ] {
             let directory = tempfile::tempdir().unwrap();
             let stub = stub(412).await;
-            let error = edit(&stub.client(), &key(), force, TO_MOBILE, directory.path())
-                .await
-                .unwrap_err();
+            let error =
+                edit(&stub.client(), &key(), force, TO_MOBILE, directory.path()).await.unwrap_err();
             assert_eq!(error.exit() as u8, 5);
             let put = stub.asked().pop().unwrap();
             assert_eq!(put.header("if-match"), Some(tag));
@@ -274,15 +288,9 @@ mod tests {
             assert_eq!(put.json().get("revision"), None);
             let file = left(directory.path()).remove(0);
             let text = error.to_string();
-            assert!(
-                text.contains(advice) && text.contains(&file.display().to_string()),
-                "{text}"
-            );
+            assert!(text.contains(advice) && text.contains(&file.display().to_string()), "{text}");
             let kept = &files::read(&[file]).unwrap()[0].value;
-            assert_eq!(
-                (&kept["revision"], &kept["spec"]["type"]),
-                (&revision, &json!("mobile"))
-            );
+            assert_eq!((&kept["revision"], &kept["spec"]["type"]), (&revision, &json!("mobile")));
         }
     }
 
@@ -291,9 +299,8 @@ mod tests {
         for editor in ["sed -i 's/kind:/kind: [/'", "sed -i s/robot-1/robot-2/"] {
             let directory = tempfile::tempdir().unwrap();
             let stub = stub(200).await;
-            let error = edit(&stub.client(), &key(), false, editor, directory.path())
-                .await
-                .unwrap_err();
+            let error =
+                edit(&stub.client(), &key(), false, editor, directory.path()).await.unwrap_err();
             assert_eq!(error.exit() as u8, 7, "{error}");
             assert_eq!(left(directory.path()).len(), 1);
             assert_eq!(stub.asked().len(), 1);

@@ -17,7 +17,8 @@ use crate::output::{self, Align, Format, terminal_width};
 #[derive(Debug, Args)]
 pub struct EffectiveOptions {
     /// The service, or SERVICE/INSTANCE; without it the node's or layer's own configuration
-    #[arg(value_name = "SERVICE", value_parser = parse_wanted, required_unless_present_any = ["node", "layer"])]
+    #[arg(value_name = "SERVICE", value_parser = parse_wanted,
+        required_unless_present_any = ["node", "layer"])]
     pub wanted: Option<Wanted>,
     /// The instance of the service
     #[arg(long, value_name = "INSTANCE", requires = "wanted")]
@@ -52,17 +53,11 @@ fn parse_wanted(text: &str) -> Result<Wanted, String> {
     let (service, instance) = match text.split_once('/') {
         Some((service, instance)) => {
             let name = instance.parse::<InstanceName>();
-            (
-                service,
-                Some(name.map_err(|error| format!("instance {instance:?} {error}"))?),
-            )
+            (service, Some(name.map_err(|error| format!("instance {instance:?} {error}"))?))
         }
         None => (text, None),
     };
-    Ok(Wanted {
-        service: parse_service(service)?,
-        instance,
-    })
+    Ok(Wanted { service: parse_service(service)?, instance })
 }
 
 /// Shows an effective configuration.
@@ -87,10 +82,7 @@ fn call(options: &EffectiveOptions) -> Result<Call, CliError> {
     }
     Ok(Call::get(format!("{BASE}/effective"))
         .query_if("service", wanted.map(|wanted| wanted.service.as_str()))
-        .query_if(
-            "instance",
-            options.instance.as_ref().or(behind).map(InstanceName::as_str),
-        )
+        .query_if("instance", options.instance.as_ref().or(behind).map(InstanceName::as_str))
         .query_if("node", options.node.as_ref().map(NodeName::as_str))
         .query_if("layer", options.layer.as_ref().map(LayerName::as_str))
         .query_if("explain", options.explain.then_some("true"))
@@ -167,7 +159,8 @@ mod tests {
     use super::*;
 
     fn answer() -> Value {
-        json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": 412, "hash": "sha256:x",
+        json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1",
+            "revision": 412, "hash": "sha256:x",
             "rollout": null, "config": {"camera": {"rate_hz": 10}}})
     }
 
@@ -177,11 +170,14 @@ mod tests {
             text(&answer()),
             "# slam/0 on node robot-1 in layer edge, revision 412\ncamera:\n  rate_hz: 10\n"
         );
-        let layer = json!({"service": null, "layer": "edge", "revision": 3, "rollout": "slower", "config": {}});
-        assert_eq!(
-            text(&layer),
-            "# in layer edge, revision 3, with the roll-out slower\n{}\n"
-        );
+        let layer = json!({
+            "service": null,
+            "layer": "edge",
+            "revision": 3,
+            "rollout": "slower",
+            "config": {},
+        });
+        assert_eq!(text(&layer), "# in layer edge, revision 3, with the roll-out slower\n{}\n");
     }
 
     #[test]
@@ -190,14 +186,17 @@ mod tests {
         answer["explain"] = json!({
             "/camera/rate_hz": {"kind": "Instance", "service": "slam", "name": "0", "revision": 88,
                 "overridden": [{"kind": "Service", "name": "slam", "revision": 3, "value": 30}]},
-            "/log": {"removed": true, "kind": "Layer", "name": "edge", "revision": 5, "override": true},
+            "/log": {
+                "removed": true,
+                "kind": "Layer",
+                "name": "edge",
+                "revision": 5,
+                "override": true,
+            },
         });
         let text = text(&answer);
         let lines: Vec<&str> = text.lines().collect();
-        assert!(
-            lines[2].contains(" 10 ") && lines[2].contains(" instance/slam/0 @88 "),
-            "{text}"
-        );
+        assert!(lines[2].contains(" 10 ") && lines[2].contains(" instance/slam/0 @88 "), "{text}");
         assert!(lines[2].ends_with(" 30 of service/slam @3"), "{text}");
         assert!(
             lines[3].contains("(removed)") && lines[3].contains("layer/edge @5 (overrides)"),

@@ -77,7 +77,8 @@ impl TokenSource {
     /// Reads it.
     ///
     /// # Errors
-    /// [`CliError::Failed`] when the file cannot be read, [`CliError::Invalid`] for what is no token. Neither shows it.
+    /// [`CliError::Failed`] when the file cannot be read, [`CliError::Invalid`] for what is no
+    /// token. Neither shows it.
     pub(crate) fn read(&self) -> Result<Token, CliError> {
         let (text, place) = match self {
             Self::File(file) => {
@@ -91,7 +92,8 @@ impl TokenSource {
         let visible = text.bytes().all(|byte| byte.is_ascii_graphic());
         if text.is_empty() || text.len() > MAX_TOKEN_BYTES || !visible {
             return Err(CliError::Invalid(format!(
-                "{place} holds no token: one line of up to {MAX_TOKEN_BYTES} visible ASCII characters"
+                "{place} holds no token: one line of up to {MAX_TOKEN_BYTES} visible ASCII \
+                 characters"
             )));
         }
         Ok(Token(text.to_owned()))
@@ -123,12 +125,7 @@ pub(crate) struct Endpoint {
 impl Endpoint {
     /// A server to which neither certificate nor token is shown.
     pub(crate) fn at(url: Url) -> Self {
-        Self {
-            url,
-            ca_file: None,
-            client_certificate: None,
-            token: None,
-        }
+        Self { url, ca_file: None, client_certificate: None, token: None }
     }
 
     /// The server as people write it.
@@ -144,19 +141,23 @@ impl Endpoint {
 
 /// Puts together what options, environment and context say, each part from the first that has it.
 ///
-/// A context's token, authorities and certificate belong to its server: they go to another one only where the context is named
-/// on the command line.
+/// A context's token, authorities and certificate belong to its server: they go to another one only
+/// where the context is named on the command line.
 ///
 /// # Errors
-/// [`CliError::Usage`] for an unknown context, a bad URL, a key without its certificate, or a token that would go in clear over
-/// a network;
-/// [`CliError::Invalid`] for a bad file of contexts.
-pub(crate) fn resolve(options: &ServerOptions, around: &Surroundings) -> Result<Endpoint, CliError> {
+/// [`CliError::Usage`] for an unknown context, a bad URL, a key without its certificate, or a token
+/// that would go in clear over a network; [`CliError::Invalid`] for a bad file of contexts.
+pub(crate) fn resolve(
+    options: &ServerOptions,
+    around: &Surroundings,
+) -> Result<Endpoint, CliError> {
     let endpoint = choose(options, around)?;
     let url = &endpoint.url;
     if endpoint.token.is_some() && !endpoint.is_tls() && !is_loopback(url) {
         return Err(CliError::Usage(format!(
-            "the token would go in clear to {url}: whoever sees the network could use it.\n  Use https:// (with --ca-file for an authority of your own), or a tunnel that ends on this machine: http://127.0.0.1:PORT."
+            "the token would go in clear to {url}: whoever sees the network could use it.\n  Use \
+             https:// (with --ca-file for an authority of your own), or a tunnel that ends on this \
+             machine: http://127.0.0.1:PORT."
         )));
     }
     Ok(endpoint)
@@ -170,8 +171,10 @@ pub(crate) fn choose(options: &ServerOptions, around: &Surroundings) -> Result<E
     let context = chosen_context(options, around)?;
     let named = options.server.as_deref().or(around.server.as_deref());
     let own_server = context.as_ref().map(|context| context.server.as_str());
-    let url = parse_server(named.or(own_server).unwrap_or(DEFAULT_SERVER)).map_err(CliError::Usage)?;
-    let belongs = options.context.is_some() || own_server.is_some_and(|own| parse_server(own).as_ref() == Ok(&url));
+    let url =
+        parse_server(named.or(own_server).unwrap_or(DEFAULT_SERVER)).map_err(CliError::Usage)?;
+    let belongs = options.context.is_some()
+        || own_server.is_some_and(|own| parse_server(own).as_ref() == Ok(&url));
     let context = context.filter(|_| belongs);
     let token = options
         .token_file
@@ -180,29 +183,27 @@ pub(crate) fn choose(options: &ServerOptions, around: &Surroundings) -> Result<E
         .map(TokenSource::File)
         .or_else(|| around.token.clone().map(TokenSource::Variable))
         .or_else(|| context.as_ref()?.token_file.clone().map(TokenSource::File));
-    let client_certificate = own_certificate(options, around)?.or_else(|| of_context(context.as_ref()?));
+    let client_certificate =
+        own_certificate(options, around)?.or_else(|| of_context(context.as_ref()?));
     let ca_file = options.ca_file.clone().or_else(|| context?.ca_file);
-    Ok(Endpoint {
-        url,
-        ca_file,
-        client_certificate,
-        token,
-    })
+    Ok(Endpoint { url, ca_file, client_certificate, token })
 }
 
-/// The certificate that options or environment name. Certificate and key come from the same of them: they are a pair.
-fn own_certificate(options: &ServerOptions, around: &Surroundings) -> Result<Option<ClientCertificate>, CliError> {
+/// The certificate that options or environment name. Certificate and key come from the same of
+/// them: they are a pair.
+fn own_certificate(
+    options: &ServerOptions,
+    around: &Surroundings,
+) -> Result<Option<ClientCertificate>, CliError> {
     let pair = |cert_file: &PathBuf, key_file: &Option<PathBuf>| {
-        Some(ClientCertificate {
-            cert_file: cert_file.clone(),
-            key_file: key_file.clone(),
-        })
+        Some(ClientCertificate { cert_file: cert_file.clone(), key_file: key_file.clone() })
     };
     match (&options.client_cert, &around.client_cert, &around.client_key) {
         (Some(cert_file), _, _) => Ok(pair(cert_file, &options.client_key)),
         (None, Some(cert_file), _) => Ok(pair(cert_file, &around.client_key)),
         (None, None, Some(_)) => Err(CliError::Usage(
-            "BLAZE_CLIENT_KEY is set, BLAZE_CLIENT_CERT is not: a key goes with its certificate".to_owned(),
+            "BLAZE_CLIENT_KEY is set, BLAZE_CLIENT_CERT is not: a key goes with its certificate"
+                .to_owned(),
         )),
         (None, None, None) => Ok(None),
     }
@@ -215,7 +216,10 @@ fn of_context(context: &Context) -> Option<ClientCertificate> {
     })
 }
 
-fn chosen_context(options: &ServerOptions, around: &Surroundings) -> Result<Option<Context>, CliError> {
+fn chosen_context(
+    options: &ServerOptions,
+    around: &Surroundings,
+) -> Result<Option<Context>, CliError> {
     let Some(file) = &around.contexts else {
         return match &options.context {
             Some(name) => Err(CliError::Usage(format!(
@@ -236,9 +240,12 @@ fn chosen_context(options: &ServerOptions, around: &Surroundings) -> Result<Opti
 
 /// What is said of a context that does not exist.
 pub(crate) fn unknown_context<'a>(name: &str, known: impl Iterator<Item = &'a String>) -> String {
-    let meant =
-        closest(name, known.map(String::as_str)).map_or_else(String::new, |meant| format!("; did you mean {meant}?"));
-    format!("there is no context {name}{meant}\n  `blaze context list` shows all, `blaze context add` makes one.")
+    let meant = closest(name, known.map(String::as_str))
+        .map_or_else(String::new, |meant| format!("; did you mean {meant}?"));
+    format!(
+        "there is no context {name}{meant}\n  `blaze context list` shows all, `blaze context add` \
+         makes one."
+    )
 }
 
 /// Reads the URL of a server: scheme, host and perhaps port, nothing else.
@@ -252,7 +259,8 @@ pub(crate) fn parse_server(text: &str) -> Result<Url, String> {
     }
     let url = Url::parse(text).map_err(|error| format!("the URL of the server: {error}"))?;
     if !url.username().is_empty() || url.password().is_some() {
-        return Err("the URL of the server holds a user or password; give a token by --token-file".to_owned());
+        return Err("the URL of the server holds a user or password; give a token by --token-file"
+            .to_owned());
     }
     if !matches!(url.scheme(), "http" | "https") || url.host_str().is_none_or(str::is_empty) {
         return Err(format!(
@@ -297,10 +305,7 @@ mod tests {
             Ok(())
         })
         .unwrap();
-        Surroundings {
-            contexts: Some(file),
-            ..Surroundings::default()
-        }
+        Surroundings { contexts: Some(file), ..Surroundings::default() }
     }
 
     #[test]
@@ -308,8 +313,9 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let mut around = around(directory.path());
         let mut options = ServerOptions::default();
-        let server =
-            |options: &ServerOptions, around: &Surroundings| resolve(options, around).unwrap().server().to_owned();
+        let server = |options: &ServerOptions, around: &Surroundings| {
+            resolve(options, around).unwrap().server().to_owned()
+        };
         assert_eq!(server(&options, &Surroundings::default()), DEFAULT_SERVER);
         assert_eq!(server(&options, &around), "https://lab.example");
         options.context = Some("hall".to_owned());
@@ -325,7 +331,9 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let mut around = around(directory.path());
         let mut options = ServerOptions::default();
-        let token = |options: &ServerOptions, around: &Surroundings| resolve(options, around).unwrap().token;
+        let token = |options: &ServerOptions, around: &Surroundings| {
+            resolve(options, around).unwrap().token
+        };
         assert_eq!(token(&options, &Surroundings::default()), None);
         let file = |name: &str| Some(TokenSource::File(directory.path().join(name)));
         assert_eq!(token(&options, &around), file("lab"));
@@ -342,8 +350,9 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let mut around = around(directory.path());
         let mut options = ServerOptions::default();
-        let shown =
-            |options: &ServerOptions, around: &Surroundings| resolve(options, around).unwrap().client_certificate;
+        let shown = |options: &ServerOptions, around: &Surroundings| {
+            resolve(options, around).unwrap().client_certificate
+        };
         let pair = |cert_file: &str, key_file: Option<&str>| {
             Some(ClientCertificate {
                 cert_file: PathBuf::from(cert_file),
@@ -388,23 +397,15 @@ mod tests {
 
     #[test]
     fn a_token_never_goes_in_clear_over_a_network() {
-        let around = Surroundings {
-            token: Some(Token::of("sesame")),
-            ..Surroundings::default()
-        };
+        let around = Surroundings { token: Some(Token::of("sesame")), ..Surroundings::default() };
         let with = |server: &str| {
-            let options = ServerOptions {
-                server: Some(server.to_owned()),
-                ..ServerOptions::default()
-            };
+            let options =
+                ServerOptions { server: Some(server.to_owned()), ..ServerOptions::default() };
             resolve(&options, &around)
         };
-        for good in [
-            "http://127.0.0.1:1",
-            "http://[::1]:1",
-            "http://localhost",
-            "https://robot.example",
-        ] {
+        for good in
+            ["http://127.0.0.1:1", "http://[::1]:1", "http://localhost", "https://robot.example"]
+        {
             assert!(with(good).is_ok(), "{good}");
         }
         for bad in [
@@ -438,15 +439,10 @@ mod tests {
     #[test]
     fn unknown_contexts_get_a_suggestion() {
         let directory = tempfile::tempdir().unwrap();
-        let options = ServerOptions {
-            context: Some("hal".to_owned()),
-            ..ServerOptions::default()
-        };
+        let options = ServerOptions { context: Some("hal".to_owned()), ..ServerOptions::default() };
         let error = resolve(&options, &around(directory.path())).unwrap_err();
         assert!(
-            error
-                .to_string()
-                .contains("there is no context hal; did you mean hall?\n  `blaze"),
+            error.to_string().contains("there is no context hal; did you mean hall?\n  `blaze"),
             "{error}"
         );
     }

@@ -27,7 +27,8 @@ const KINDS: [Kind; 4] = [Kind::Layer, Kind::Node, Kind::Service, Kind::Instance
 /// Options of `blaze export`.
 #[derive(Debug, Args)]
 pub struct ExportOptions {
-    /// Only what a worker of this layer needs: the layer, its nodes, the services that it may see, and their instances there
+    /// Only what a worker of this layer needs: the layer, its nodes, the services that it may see,
+    /// and their instances there
     #[arg(long, value_name = "LAYER")]
     pub layer: Option<LayerName>,
     /// With roll-outs. Applied elsewhere, they begin there
@@ -55,19 +56,15 @@ pub(super) async fn run(options: &ExportOptions, format: Format) -> Result<Exit,
     let documents: Vec<Value> = all.into_values().map(clean).collect();
     output::print(&match format {
         Format::Table | Format::Yaml => {
-            format!(
-                "# {}, revision {revision}\n{}",
-                client.server(),
-                yaml::documents(&documents)
-            )
+            format!("# {}, revision {revision}\n{}", client.server(), yaml::documents(&documents))
         }
         Format::Json => json_pretty(&documents)?,
     })?;
     Ok(Exit::Done)
 }
 
-/// All documents as they were at one revision. The lists of the kinds come one after the other; what was written between
-/// them is taken from the watch.
+/// All documents as they were at one revision. The lists of the kinds come one after the other;
+/// what was written between them is taken from the watch.
 async fn read(client: &Client, rollouts: bool) -> Result<(BTreeMap<Key, Value>, u64), CliError> {
     for _ in 0..TRIES {
         let mut all = BTreeMap::new();
@@ -77,7 +74,8 @@ async fn read(client: &Client, rollouts: bool) -> Result<(BTreeMap<Key, Value>, 
             let revision = listing.revision.ok_or_else(|| client.odd("a list has no revision"))?;
             listed.insert(kind, revision);
             for document in listing.items {
-                let key = key_of(&document).map_err(|reason| client.odd(format!("a document {reason}")))?;
+                let key = key_of(&document)
+                    .map_err(|reason| client.odd(format!("a document {reason}")))?;
                 all.insert(key, document);
             }
         }
@@ -90,7 +88,8 @@ async fn read(client: &Client, rollouts: bool) -> Result<(BTreeMap<Key, Value>, 
     )))
 }
 
-/// Brings lists to the newest of their revisions, and says which that is; `None` where the history does not reach back.
+/// Brings lists to the newest of their revisions, and says which that is; `None` where the history
+/// does not reach back.
 async fn catch_up(
     client: &Client,
     all: &mut BTreeMap<Key, Value>,
@@ -147,19 +146,33 @@ mod tests {
             json!({"kind": "Service", "name": "slam", "spec": {"layers": ["edge"]}}),
             json!({"kind": "Service", "name": "log", "spec": {}}),
             json!({"kind": "Service", "name": "map", "spec": {"layers": ["fog"]}}),
-            json!({"kind": "Instance", "service": "slam", "name": "0", "spec": {"node": "robot-1"}}),
+            json!({
+                "kind": "Instance",
+                "service": "slam",
+                "name": "0",
+                "spec": {"node": "robot-1"},
+            }),
             json!({"kind": "Instance", "service": "log", "name": "0", "spec": {"node": "fog-1"}}),
             json!({"kind": "Instance", "service": "log", "name": "1", "spec": {"layer": "edge"}}),
             json!({"kind": "Instance", "service": "log", "name": "2", "spec": {}}),
             json!({"kind": "Instance", "service": "map", "name": "0", "spec": {}}),
-            json!({"kind": "Rollout", "name": "a", "spec": {"target": {"kind": "Instance", "service": "log", "name": "1"}}}),
-            json!({"kind": "Rollout", "name": "b", "spec": {"target": {"kind": "Instance", "service": "log", "name": "0"}}}),
-            json!({"kind": "Rollout", "name": "c", "spec": {"target": {"kind": "Rollout", "name": "c"}}}),
+            json!({
+                "kind": "Rollout",
+                "name": "a",
+                "spec": {"target": {"kind": "Instance", "service": "log", "name": "1"}},
+            }),
+            json!({
+                "kind": "Rollout",
+                "name": "b",
+                "spec": {"target": {"kind": "Instance", "service": "log", "name": "0"}},
+            }),
+            json!({
+                "kind": "Rollout",
+                "name": "c",
+                "spec": {"target": {"kind": "Rollout", "name": "c"}},
+            }),
         ];
-        documents
-            .into_iter()
-            .map(|document| (key_of(&document).unwrap(), document))
-            .collect()
+        documents.into_iter().map(|document| (key_of(&document).unwrap(), document)).collect()
     }
 
     #[test]
@@ -187,23 +200,42 @@ mod tests {
 
     #[tokio::test]
     async fn what_is_written_between_the_lists_is_in_the_export_whole() {
-        let node = |name: &str, revision: u64| json!({"kind": "Node", "name": name, "spec": {}, "revision": revision});
+        let node = |name: &str, revision: u64| {
+            json!({
+                "kind": "Node",
+                "name": name,
+                "spec": {},
+                "revision": revision,
+            })
+        };
         let stub = Stub::start(move |asked: &Asked, _| {
-            // Layers are listed at 410; nodes and the rest at 412: commit 411 made a layer and changed a node, 412 deleted
-            // a layer, 413 is later.
+            // Layers are listed at 410; nodes and the rest at 412: commit 411 made a layer and
+            // changed a node, 412 deleted a layer, 413 is later.
             let change = |op: &str, kind: &str, name: &str| {
-                json!({"op": op, "kind": kind, "name": name, "document": {"kind": kind, "name": name, "spec": {}}})
+                json!({
+                    "op": op,
+                    "kind": kind,
+                    "name": name,
+                    "document": {"kind": kind, "name": name, "spec": {}},
+                })
             };
             let event = |revision: u64, changes: Value| {
                 let data = json!({"revision": revision, "changes": changes});
                 format!("id: {revision}\nevent: change\ndata: {data}\n\n")
             };
             match asked.target.as_str() {
-                target if target.starts_with("/api/v1/layers") => list(&json!([{"kind": "Layer", "name": "old", "spec": {}}]), 410),
-                target if target.starts_with("/api/v1/nodes") => list(&json!([node("a", 411)]), 412),
+                target if target.starts_with("/api/v1/layers") => {
+                    list(&json!([{"kind": "Layer", "name": "old", "spec": {}}]), 410)
+                }
+                target if target.starts_with("/api/v1/nodes") => {
+                    list(&json!([node("a", 411)]), 412)
+                }
                 "/api/v1/watch?since=410" => Reply::Events(format!(
                     "{}{}{}",
-                    event(411, json!([change("create", "Layer", "new"), change("update", "Node", "a")])),
+                    event(
+                        411,
+                        json!([change("create", "Layer", "new"), change("update", "Node", "a")]),
+                    ),
                     event(412, json!([change("delete", "Layer", "old")])),
                     event(413, json!([change("create", "Layer", "later")])),
                 )),

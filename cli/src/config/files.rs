@@ -75,8 +75,8 @@ pub(crate) fn small(file: &Path, what: &str) -> Result<Vec<u8>, CliError> {
 /// Reads all documents of `-f FILE|DIR|-`. Empty documents are passed over.
 ///
 /// # Errors
-/// [`CliError::Failed`] for what cannot be read, [`CliError::Usage`] for a directory without documents,
-/// [`CliError::Invalid`] with every fault, one a line.
+/// [`CliError::Failed`] for what cannot be read, [`CliError::Usage`] for a directory without
+/// documents, [`CliError::Invalid`] with every fault, one a line.
 pub(crate) fn read(paths: &[PathBuf]) -> Result<Vec<Source>, CliError> {
     read_from(paths, &mut std::io::stdin().lock())
 }
@@ -85,11 +85,7 @@ fn read_from(paths: &[PathBuf], stdin: &mut dyn Read) -> Result<Vec<Source>, Cli
     let mut texts = Vec::new();
     let mut left = MAX_BYTES;
     for path in expand(paths)? {
-        let name = if is_stdin(&path) {
-            "stdin".to_owned()
-        } else {
-            path.display().to_string()
-        };
+        let name = if is_stdin(&path) { "stdin".to_owned() } else { path.display().to_string() };
         let bytes = if is_stdin(&path) {
             bounded(stdin, left)
         } else {
@@ -120,11 +116,7 @@ fn read_from(paths: &[PathBuf], stdin: &mut dyn Read) -> Result<Vec<Source>, Cli
             sources.len()
         ));
     }
-    if faults.is_empty() {
-        Ok(sources)
-    } else {
-        Err(CliError::Invalid(faults.join("\n  ")))
-    }
+    if faults.is_empty() { Ok(sources) } else { Err(CliError::Invalid(faults.join("\n  "))) }
 }
 
 fn is_stdin(path: &Path) -> bool {
@@ -144,13 +136,14 @@ fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CliError> {
             out.push(path.clone());
             continue;
         }
-        let failed = |error: std::io::Error| CliError::Failed(format!("{}: {error}", path.display()));
+        let failed =
+            |error: std::io::Error| CliError::Failed(format!("{}: {error}", path.display()));
         let mut files = Vec::new();
         for entry in std::fs::read_dir(path).map_err(failed)? {
             let file = entry.map_err(failed)?.path();
-            let known = file
-                .extension()
-                .is_some_and(|extension| ["yaml", "yml", "json"].iter().any(|known| extension == *known));
+            let known = file.extension().is_some_and(|extension| {
+                ["yaml", "yml", "json"].iter().any(|known| extension == *known)
+            });
             if known && file.is_file() {
                 files.push(file);
             }
@@ -196,7 +189,8 @@ fn parse(path: &Path, name: &str, bytes: Vec<u8>) -> Result<Vec<(Value, Origin)>
         // `{ kind: Layer, … }` and `{…}` behind `---` are YAML.
         match parse_json(text, name) {
             Ok(read) => read,
-            Err(faults) => parse_yaml(text, name).map_err(|others| if is_quoted(text) { faults } else { others })?,
+            Err(faults) => parse_yaml(text, name)
+                .map_err(|others| if is_quoted(text) { faults } else { others })?,
         }
     } else {
         parse_yaml(text, name)?
@@ -209,11 +203,8 @@ type Parsed = Vec<(usize, Value)>;
 
 fn parse_json(text: &str, name: &str) -> Result<Parsed, Vec<String>> {
     let value = json::parse_within(text.as_bytes(), MAX_DEPTH).map_err(|fault| {
-        let pointer = if fault.pointer.is_empty() {
-            String::new()
-        } else {
-            format!("{}: ", fault.pointer)
-        };
+        let pointer =
+            if fault.pointer.is_empty() { String::new() } else { format!("{}: ", fault.pointer) };
         vec![format!("{name}:{}: {pointer}{}", fault.line, fault.detail)]
     })?;
     Ok(vec![(0, value)])
@@ -226,7 +217,8 @@ fn parse_yaml(text: &str, name: &str) -> Result<Parsed, Vec<String>> {
     })
 }
 
-/// Whether a text that is neither JSON nor YAML was meant as JSON: its first member has a quoted name.
+/// Whether a text that is neither JSON nor YAML was meant as JSON: its first member has a quoted
+/// name.
 fn is_quoted(text: &str) -> bool {
     let begin = text.trim_start_matches(|c: char| c.is_whitespace() || matches!(c, '[' | '{'));
     begin.starts_with('"')
@@ -238,14 +230,12 @@ fn in_file(mut fault: LocatedFault, name: &str) -> LocatedFault {
         Place::File { line, .. } | Place::Line(line) => line,
         Place::Nowhere | Place::Overlay { .. } | Place::Environment(_) | Place::Override(_) => 0,
     };
-    fault.place = Place::File {
-        file: Arc::from(name),
-        line,
-    };
+    fault.place = Place::File { file: Arc::from(name), line };
     fault
 }
 
-/// Takes lists apart (`[…]`, and `{"items": […]}` as `blaze get` prints it) and says where each document comes from.
+/// Takes lists apart (`[…]`, and `{"items": […]}` as `blaze get` prints it) and says where each
+/// document comes from.
 fn located(values: Parsed, name: &str) -> Vec<(Value, Origin)> {
     let mut found = Vec::new();
     for (line, value) in values {
@@ -253,7 +243,8 @@ fn located(values: Parsed, name: &str) -> Vec<(Value, Origin)> {
             Value::Null => {}
             Value::Array(items) => found.extend(items.into_iter().map(|item| (item, line))),
             Value::Object(mut members)
-                if !members.contains_key("kind") && members.get("items").is_some_and(Value::is_array) =>
+                if !members.contains_key("kind")
+                    && members.get("items").is_some_and(Value::is_array) =>
             {
                 if let Some(Value::Array(items)) = members.shift_remove("items") {
                     found.extend(items.into_iter().map(|item| (item, line)));
@@ -264,16 +255,9 @@ fn located(values: Parsed, name: &str) -> Vec<(Value, Origin)> {
     }
     let several = found.len() > 1;
     let file: Arc<str> = Arc::from(name);
-    let origin = |line, number| Origin {
-        file: Arc::clone(&file),
-        line,
-        number,
-        several,
-    };
+    let origin = |line, number| Origin { file: Arc::clone(&file), line, number, several };
     let numbered = (1..).zip(found);
-    numbered
-        .map(|(number, (value, line))| (value, origin(line, number)))
-        .collect()
+    numbered.map(|(number, (value, line))| (value, origin(line, number))).collect()
 }
 
 #[cfg(test)]

@@ -4,15 +4,16 @@ use serde_json::json;
 
 use super::*;
 
-const TWO: &str =
-    "# robots\nkind: Node\nname: robot-1\nspec: { layer: edge }\n---\n# the second\n\nkind: Node\nname: robot-2\n";
+const TWO: &str = "# robots\nkind: Node\nname: robot-1\nspec: { layer: edge }\n---\n# the second\n\nkind: Node\nname: robot-2\n";
 
 fn read_text(name: &str, text: &str) -> Result<Vec<Source>, CliError> {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join(name);
     fs::write(&file, text).unwrap();
     read_from(&[file], &mut std::io::empty()).map_err(|error| match error {
-        CliError::Invalid(text) => CliError::Invalid(text.replace(&format!("{}/", directory.path().display()), "")),
+        CliError::Invalid(text) => {
+            CliError::Invalid(text.replace(&format!("{}/", directory.path().display()), ""))
+        }
         other => other,
     })
 }
@@ -37,14 +38,8 @@ fn documents_know_where_they_come_from() {
 
 #[test]
 fn every_fault_has_its_place_and_nothing_is_taken() {
-    assert!(
-        faults("a.yaml", "kind: Node\nname: a\nname: b\n").contains("a.yaml:3"),
-        "given twice"
-    );
-    let text = faults(
-        "a.yaml",
-        "kind: Node\nname: A\n---\nkind: Nod\nname: b\n---\njust text\n",
-    );
+    assert!(faults("a.yaml", "kind: Node\nname: a\nname: b\n").contains("a.yaml:3"), "given twice");
+    let text = faults("a.yaml", "kind: Node\nname: A\n---\nkind: Nod\nname: b\n---\njust text\n");
     for part in [
         "a.yaml:1 (document 1): name",
         "a.yaml:4 (document 2): kind",
@@ -93,10 +88,7 @@ fn standard_input_that_begins_like_json_may_be_yaml() {
     let told = |text: &str| read_stdin(text).unwrap_err().to_string();
     let text = told("{\"kind\": \"Node\",\n\"name\": \"a\", \"name\": \"b\"}");
     assert!(text.starts_with("stdin:2: "), "{text}");
-    assert!(
-        told("{ kind: Layer, name: [ }\n").contains("stdin"),
-        "flow that does not end"
-    );
+    assert!(told("{ kind: Layer, name: [ }\n").contains("stdin"), "flow that does not end");
 }
 
 #[test]

@@ -25,7 +25,8 @@ pub struct AuditOptions {
     /// Only documents of this name
     #[arg(long, value_name = "NAME")]
     pub name: Option<String>,
-    /// Only this action: create, update, patch, delete, rollback, apply, reveal, token_create, token_revoke, trim, …
+    /// Only this action: create, update, patch, delete, rollback, apply, reveal, token_create,
+    /// token_revoke, trim, …
     #[arg(long, value_name = "ACTION")]
     pub action: Option<String>,
     /// Only what was allowed, or only what was refused
@@ -38,7 +39,8 @@ pub struct AuditOptions {
     #[arg(long, value_name = "TIME", value_parser = parse_time)]
     pub until: Option<Timestamp>,
     /// At most so many entries, the newest
-    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 100,
+        value_parser = clap::value_parser!(u64).range(1..))]
     pub limit: u64,
     /// Which server.
     #[command(flatten)]
@@ -49,8 +51,9 @@ fn parse_time(text: &str) -> Result<Timestamp, String> {
     if let Ok(time) = text.parse::<Timestamp>() {
         return Ok(time);
     }
-    let ago = parse_duration(text)
-        .map_err(|_| format!("{text:?} is neither a time, as 2026-11-21T07:01:12Z, nor a duration, as 24h"))?;
+    let ago = parse_duration(text).map_err(|_| {
+        format!("{text:?} is neither a time, as 2026-11-21T07:01:12Z, nor a duration, as 24h")
+    })?;
     let ago = i64::try_from(ago.as_millis()).unwrap_or(i64::MAX);
     Ok(Timestamp::from_millis(now_ms().saturating_sub(ago)))
 }
@@ -117,10 +120,7 @@ pub(super) async fn audit(options: &AuditOptions, format: Format) -> Result<Exit
         return Ok(Exit::Done);
     }
     if listing.is_cut() {
-        note(
-            format,
-            "there are older entries: --limit N shows more, --since and --until fewer",
-        );
+        note(format, "there are older entries: --limit N shows more, --since and --until fewer");
     }
     print(&listing.into_json(), format, |listing| {
         audit_table(list(listing, "items"), now_ms(), terminal_width())
@@ -128,7 +128,9 @@ pub(super) async fn audit(options: &AuditOptions, format: Format) -> Result<Exit
 }
 
 /// An instance may be given as `SERVICE/NAME`; the server filters by the name alone.
-fn service_and_name(options: &AuditOptions) -> Result<(Option<ServiceName>, Option<String>), CliError> {
+fn service_and_name(
+    options: &AuditOptions,
+) -> Result<(Option<ServiceName>, Option<String>), CliError> {
     match options.name.as_deref().map(|name| (name, name.split_once('/'))) {
         None => Ok((None, None)),
         Some((name, None)) => Ok((None, Some(name.to_owned()))),
@@ -140,7 +142,8 @@ fn service_and_name(options: &AuditOptions) -> Result<(Option<ServiceName>, Opti
 }
 
 fn audit_table(entries: &[Value], now_ms: i64, width: Option<u16>) -> String {
-    let document = |entry: &Value| key_of(entry).map_or_else(|_| cell(entry.get("name")), |key| name_of(&key));
+    let document =
+        |entry: &Value| key_of(entry).map_or_else(|_| cell(entry.get("name")), |key| name_of(&key));
     output::table(
         entries,
         width,
@@ -170,9 +173,17 @@ mod tests {
     #[test]
     fn workers_are_a_table() {
         let workers = [
-            json!({"layer": "edge", "node": "robot-1", "worker_id": "w1", "version": "0.1.0", "connected": true, "revision": 412,
+            json!({"layer": "edge", "node": "robot-1", "worker_id": "w1", "version": "0.1.0",
+                "connected": true, "revision": 412,
                 "digest": "sha256:x", "in_sync": true, "last_seen": "2026-11-21T07:01:10.345Z"}),
-            json!({"layer": "fog", "node": null, "worker_id": "w2", "connected": false, "revision": null, "in_sync": null}),
+            json!({
+                "layer": "fog",
+                "node": null,
+                "worker_id": "w2",
+                "connected": false,
+                "revision": null,
+                "in_sync": null,
+            }),
         ];
         assert_eq!(
             workers_table(&workers, NOW, None),
@@ -184,24 +195,18 @@ mod tests {
 
     #[test]
     fn refusals_show_their_code() {
-        let entries = [
-            json!({"id": "1", "time": "2026-11-21T06:01:12.345Z", "revision": null, "subject": "eve",
-            "roles": ["viewer"], "action": "delete", "kind": "Instance", "service": "slam", "name": "0", "outcome": "denied",
-            "code": "permission_denied", "paths": [], "request_id": "r-1", "address": "10.0.0.9"}),
-        ];
+        let entries = [json!({"id": "1", "time": "2026-11-21T06:01:12.345Z", "revision": null,
+                "subject": "eve",
+            "roles": ["viewer"], "action": "delete", "kind": "Instance", "service": "slam",
+            "name": "0", "outcome": "denied",
+            "code": "permission_denied", "paths": [], "request_id": "r-1", "address": "10.0.0.9"})];
         let text = audit_table(&entries, NOW, None);
-        assert!(
-            text.contains("instance/slam/0  permission_denied  10.0.0.9  r-1"),
-            "{text}"
-        );
+        assert!(text.contains("instance/slam/0  permission_denied  10.0.0.9  r-1"), "{text}");
     }
 
     #[test]
     fn times_are_absolute_or_ago() {
-        assert_eq!(
-            parse_time("2026-11-21T07:01:12.345Z").unwrap(),
-            Timestamp::from_millis(NOW)
-        );
+        assert_eq!(parse_time("2026-11-21T07:01:12.345Z").unwrap(), Timestamp::from_millis(NOW));
         let ago = now_ms() - parse_time("1h").unwrap().as_millis();
         assert!((3_600_000..3_610_000).contains(&ago), "{ago}");
         assert!(parse_time("yesterday").unwrap_err().contains("24h"));

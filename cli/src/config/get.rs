@@ -67,14 +67,19 @@ impl GetOptions {
         if self.revision.is_some() && key.is_none() {
             return usage("--revision shows one document as it was: give its name");
         }
-        if self.watch && (self.limit.is_some() || self.revision.is_some() || output == Output::Name) {
+        if self.watch && (self.limit.is_some() || self.revision.is_some() || output == Output::Name)
+        {
             return usage("--watch goes with neither --limit nor --revision nor -o name");
         }
         if self.reveal && !matches!(output, Output::Json | Output::Yaml) {
-            return usage("--reveal shows secrets where they stand in documents: give -o json or -o yaml");
+            return usage(
+                "--reveal shows secrets where they stand in documents: give -o json or -o yaml",
+            );
         }
         if self.reveal && self.watch {
-            return usage("changes come without the text of secrets: --reveal goes without --watch");
+            return usage(
+                "changes come without the text of secrets: --reveal goes without --watch",
+            );
         }
         if self.watch && self.node.is_some() {
             return usage("changes cannot be watched by node; --layer and -l can");
@@ -84,7 +89,10 @@ impl GetOptions {
 
     /// Whether only some of what there is is asked for.
     fn is_filtered(&self) -> bool {
-        self.selector.is_some() || self.layer.is_some() || self.node.is_some() || self.service.is_some()
+        self.selector.is_some()
+            || self.layer.is_some()
+            || self.node.is_some()
+            || self.service.is_some()
     }
 
     fn filter(&self) -> Filter {
@@ -132,7 +140,9 @@ pub(super) async fn run(options: &GetOptions, output: Output) -> Result<Exit, Cl
             let revision = listing.revision;
             match format {
                 Format::Table => show_listing(kind, &listing, output, options.is_filtered())?,
-                Format::Json | Format::Yaml => show_value(&listing.into_json(), format, options.watch)?,
+                Format::Json | Format::Yaml => {
+                    show_value(&listing.into_json(), format, options.watch)?
+                }
             }
             revision
         }
@@ -159,7 +169,12 @@ fn show_value(value: &Value, format: Format, line: bool) -> Result<(), CliError>
     }
 }
 
-fn show_listing(kind: Kind, listing: &Listing, output: Output, is_filtered: bool) -> Result<(), CliError> {
+fn show_listing(
+    kind: Kind,
+    listing: &Listing,
+    output: Output,
+    is_filtered: bool,
+) -> Result<(), CliError> {
     if listing.is_cut() {
         let first = count(listing.items.len(), kind.word());
         eprintln!("blaze: these are the first {first}; there are more");
@@ -180,11 +195,7 @@ fn show_rows(kind: Kind, items: &[Value], output: Output) -> Result<(), CliError
         eprintln!("blaze: there are no {}", kind.collection());
         return Ok(());
     }
-    let layout = Layout {
-        wide: output == Output::Wide,
-        width: terminal_width(),
-        now_ms: now_ms(),
-    };
+    let layout = Layout { wide: output == Output::Wide, width: terminal_width(), now_ms: now_ms() };
     output::print(&tables::documents(kind, items, layout))
 }
 
@@ -236,7 +247,10 @@ mod tests {
             assert!(matches!(check(bad, Output::Table), Err(CliError::Usage(_))), "{bad}");
         }
         assert!(check("nodes -w", Output::Name).is_err());
-        assert!(check("svc slam --reveal", Output::Yaml).is_ok() && check("services --reveal", Output::Json).is_ok());
+        assert!(
+            check("svc slam --reveal", Output::Yaml).is_ok()
+                && check("services --reveal", Output::Json).is_ok()
+        );
         assert!(check("svc slam --reveal", Output::Table).is_err());
         assert!(check("svc slam --reveal -w", Output::Json).is_err());
     }

@@ -19,7 +19,8 @@ pub struct HistoryOptions {
     #[command(flatten)]
     pub document: DocumentOptions,
     /// At most so many changes, the newest
-    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 100,
+        value_parser = clap::value_parser!(u64).range(1..))]
     pub limit: u64,
     /// With the whole document after each change (json and yaml)
     #[arg(long)]
@@ -113,11 +114,9 @@ pub(super) async fn rollback(options: &RollbackOptions, format: Format) -> Resul
     // One that was deleted has no revision to insist on: it is made anew.
     let existing = client.existing(&key).await?;
     let tag = existing.map(|read| client.tag(&read, options.force)).transpose()?;
-    let call = Call::post(
-        format!("{}/rollback", document_path(&key)),
-        &json!({ "revision": options.to }),
-    )
-    .if_match(tag);
+    let call =
+        Call::post(format!("{}/rollback", document_path(&key)), &json!({ "revision": options.to }))
+            .if_match(tag);
     let document = client.send_about(&key, &call).await?.body;
     print(&document, format, |document| {
         format!(
@@ -151,9 +150,17 @@ mod tests {
     #[test]
     fn changes_are_a_table() {
         let items = [
-            json!({"revision": 412, "op": "update", "time": "2026-11-21T07:01:12.345Z", "subject": "ops", "request_id": "r",
+            json!({"revision": 412, "op": "update", "time": "2026-11-21T07:01:12.345Z",
+                "subject": "ops", "request_id": "r",
                 "paths": ["/spec/type", "/labels/site"]}),
-            json!({"revision": 9, "op": "create", "time": "2026-11-20T07:01:12.345Z", "subject": "dev", "request_id": "r", "paths": []}),
+            json!({
+                "revision": 9,
+                "op": "create",
+                "time": "2026-11-20T07:01:12.345Z",
+                "subject": "dev",
+                "request_id": "r",
+                "paths": [],
+            }),
         ];
         assert_eq!(
             table(&items, 1_795_244_472_345, None),

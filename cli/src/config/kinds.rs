@@ -51,7 +51,9 @@ impl Target {
     pub fn optional_key(&self, name: Option<&str>) -> Result<Option<Key>, CliError> {
         match (self.name.as_deref(), name) {
             (None, None) => Ok(None),
-            (Some(name), None) | (None, Some(name)) => parse_key(self.kind, name).map(Some).map_err(CliError::Usage),
+            (Some(name), None) | (None, Some(name)) => {
+                parse_key(self.kind, name).map(Some).map_err(CliError::Usage)
+            }
             (Some(first), Some(second)) => Err(CliError::Usage(format!(
                 "{}/{first} and {second}: only one name is allowed",
                 self.kind.word()
@@ -82,8 +84,12 @@ pub(crate) fn parse_kind(word: &str) -> Result<Kind, String> {
     let found = WORDS.iter().find(|(_, words)| words.contains(&wanted.as_str()));
     found.map(|(kind, _)| *kind).ok_or_else(|| {
         let words = WORDS.iter().flat_map(|(_, words)| words.iter().copied());
-        let meant = closest(&wanted, words).map_or_else(String::new, |word| format!("; did you mean {word}?"));
-        format!("{word:?} is no kind: layer (ly), node (no), service (svc), instance (inst), rollout (ro){meant}")
+        let meant = closest(&wanted, words)
+            .map_or_else(String::new, |word| format!("; did you mean {word}?"));
+        format!(
+            "{word:?} is no kind: layer (ly), node (no), service (svc), instance (inst), rollout \
+             (ro){meant}",
+        )
     })
 }
 
@@ -95,11 +101,15 @@ pub(crate) fn parse_key(kind: Kind, text: &str) -> Result<Key, String> {
     let (service, name) = match (kind, text.split_once('/')) {
         (Kind::Instance, Some((service, name))) => (Some(parse_service(service)?), name),
         (Kind::Instance, None) if text.is_empty() => {
-            return Err("an instance is SERVICE/NAME, such as slam/0; `blaze get instances` lists all".to_owned());
+            return Err(
+                "an instance is SERVICE/NAME, such as slam/0; `blaze get instances` lists all"
+                    .to_owned(),
+            );
         }
         (Kind::Instance, None) => {
             return Err(format!(
-                "an instance is SERVICE/NAME, such as {text}/0; `blaze get instances --service {text}` lists those of {text}"
+                "an instance is SERVICE/NAME, such as {text}/0; `blaze get instances --service \
+                 {text}` lists those of {text}"
             ));
         }
         (Kind::Layer | Kind::Node | Kind::Service | Kind::Rollout, _) => (None, text),
@@ -138,12 +148,12 @@ pub(crate) fn name_of(key: &Key) -> String {
 /// In words: what is missing or bad.
 pub(crate) fn key_of(value: &Value) -> Result<Key, String> {
     let text = |name: &str| value.get(name).and_then(Value::as_str);
-    let kind = text("kind").ok_or("has no kind; it is Layer, Node, Service, Instance or Rollout")?;
+    let kind =
+        text("kind").ok_or("has no kind; it is Layer, Node, Service, Instance or Rollout")?;
     let kind = kind.parse::<Kind>().map_err(|_| unknown_kind(kind))?;
     let name = text("name").ok_or("has no name")?;
-    let name = name
-        .parse::<DocumentName>()
-        .map_err(|error| format!("name {}", bad_name(name, &error)))?;
+    let name =
+        name.parse::<DocumentName>().map_err(|error| format!("name {}", bad_name(name, &error)))?;
     let service = text("service")
         .map(parse_service)
         .transpose()
@@ -151,7 +161,8 @@ pub(crate) fn key_of(value: &Value) -> Result<Key, String> {
     Key::new(kind, service, name).map_err(|error: KeyError| error.to_string())
 }
 
-/// A document of the server as far as the rules of the domain need it: what it refers to, and where it counts.
+/// A document of the server as far as the rules of the domain need it: what it refers to, and where
+/// it counts.
 ///
 /// # Errors
 /// In words: what is missing or bad.
@@ -164,10 +175,7 @@ pub(crate) fn document_of(value: &Value) -> Result<Document, String> {
 
 fn unknown_kind(found: &str) -> String {
     let kinds = Kind::ALL.iter().map(|kind| kind.as_str());
-    let near = parse_kind(found)
-        .map(Kind::as_str)
-        .ok()
-        .or_else(|| closest(found, kinds));
+    let near = parse_kind(found).map(Kind::as_str).ok().or_else(|| closest(found, kinds));
     let meant = near.map_or_else(String::new, |kind| format!("; did you mean {kind}?"));
     format!("kind {found:?} is not Layer, Node, Service, Instance or Rollout{meant}")
 }
@@ -177,7 +185,9 @@ pub(crate) fn collection_path(kind: Kind, service: Option<&ServiceName>) -> Stri
     match (kind, service) {
         (Kind::Instance, Some(service)) => format!("{BASE}/services/{service}/instances"),
         (Kind::Instance, None) => format!("{BASE}/services/-/instances"),
-        (Kind::Layer | Kind::Node | Kind::Service | Kind::Rollout, _) => format!("{BASE}/{}", kind.collection()),
+        (Kind::Layer | Kind::Node | Kind::Service | Kind::Rollout, _) => {
+            format!("{BASE}/{}", kind.collection())
+        }
     }
 }
 
@@ -206,10 +216,7 @@ mod tests {
     fn unknown_kinds_get_a_suggestion() {
         assert!(parse_kind("ndoes").unwrap_err().ends_with("did you mean nodes?"));
         let error = parse_kind("zebra").unwrap_err();
-        assert!(
-            error.contains("instance (inst)") && !error.contains("did you mean"),
-            "{error}"
-        );
+        assert!(error.contains("instance (inst)") && !error.contains("did you mean"), "{error}");
     }
 
     #[test]
@@ -252,10 +259,7 @@ mod tests {
             (json!({"kind": "Node"}), "has no name"),
             (json!({"kind": "Node", "name": "A"}), "did you mean a?"),
             (json!({"kind": "Instance", "name": "0"}), "needs its service"),
-            (
-                json!({"kind": "Node", "name": "a", "service": "slam"}),
-                "has no service",
-            ),
+            (json!({"kind": "Node", "name": "a", "service": "slam"}), "has no service"),
         ] {
             let error = key_of(&value).unwrap_err();
             assert!(error.contains(why), "{value}: {error}");

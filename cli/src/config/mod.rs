@@ -7,8 +7,8 @@
 //! files (YAML, JSON) ─► documents with FILE:LINE ─► apply, diff -f, delete -f, rollout start
 //! ```
 //!
-//! Data goes to standard output, everything else to stderr. A read is tried again once when a connection breaks; a write
-//! never is, because nobody knows whether it took effect.
+//! Data goes to standard output, everything else to stderr. A read is tried again once when a
+//! connection breaks; a write never is, because nobody knows whether it took effect.
 
 mod api;
 mod apply;
@@ -79,8 +79,8 @@ pub(crate) use text::parse_duration;
 use crate::exit::{CliError, Exit};
 use crate::output::Output;
 
-/// Commands of the configuration. KIND is layer, node, service, instance or rollout (ly no svc inst ro); an instance is
-/// called SERVICE/NAME.
+/// Commands of the configuration. KIND is layer, node, service, instance or rollout (ly no svc inst
+/// ro); an instance is called SERVICE/NAME.
 #[derive(Debug, Subcommand)]
 pub enum ConfigCommand {
     /// Documents of the configuration: one by its name, or all of a kind
@@ -89,7 +89,8 @@ pub enum ConfigCommand {
     Describe(DescribeOptions),
     /// Create, replace and delete documents from files, all or nothing
     Apply(ApplyOptions),
-    /// What `apply` would change, or what changed between two revisions; exits with 1 if anything differs
+    /// What `apply` would change, or what changed between two revisions; exits with 1 if anything
+    /// differs
     Diff(DiffOptions),
     /// Change a part of a document
     Patch(PatchOptions),

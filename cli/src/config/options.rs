@@ -8,7 +8,8 @@ use clap::Args;
 use super::kinds::{self, Target};
 use crate::exit::CliError;
 
-/// Which server, and as whom. No option takes a token's text: it would stand in the list of processes.
+/// Which server, and as whom. No option takes a token's text: it would stand in the list of
+/// processes.
 #[derive(Debug, Clone, Default, Args)]
 pub struct ServerOptions {
     /// Main service; else BLAZE_SERVER, else that of the context, else http://127.0.0.1:8080
@@ -17,16 +18,20 @@ pub struct ServerOptions {
     /// Context, instead of the current one (see `blaze context list`)
     #[arg(long, value_name = "NAME", help_heading = "Server")]
     pub context: Option<String>,
-    /// File that holds the token; else BLAZE_TOKEN_FILE, else the token in BLAZE_TOKEN, else the file of the context
+    /// File that holds the token; else BLAZE_TOKEN_FILE, else the token in BLAZE_TOKEN, else the
+    /// file of the context
     #[arg(long, value_name = "FILE", help_heading = "Server")]
     pub token_file: Option<PathBuf>,
-    /// Authorities that may sign the server's certificate (PEM); else the file of the context, else those of the system
+    /// Authorities that may sign the server's certificate (PEM); else the file of the context, else
+    /// those of the system
     #[arg(long, value_name = "FILE", help_heading = "Server")]
     pub ca_file: Option<PathBuf>,
-    /// Certificate to show to a server that asks for one (PEM); else BLAZE_CLIENT_CERT, else that of the context
+    /// Certificate to show to a server that asks for one (PEM); else BLAZE_CLIENT_CERT, else that
+    /// of the context
     #[arg(long, value_name = "FILE", help_heading = "Server")]
     pub client_cert: Option<PathBuf>,
-    /// Its private key (PEM), where it is not in the same file; with BLAZE_CLIENT_CERT it is BLAZE_CLIENT_KEY
+    /// Its private key (PEM), where it is not in the same file; with BLAZE_CLIENT_CERT it is
+    /// BLAZE_CLIENT_KEY
     #[arg(long, value_name = "FILE", requires = "client_cert", help_heading = "Server")]
     pub client_key: Option<PathBuf>,
 }

@@ -26,8 +26,8 @@ pub struct PatchOptions {
     /// Which document.
     #[command(flatten)]
     pub document: DocumentOptions,
-    /// What to change: JSON merge patch (RFC 7396), for example '{"spec":{"type":"mobile"}}'; null deletes a member. - reads
-    /// it from standard input: best for secrets
+    /// What to change: JSON merge patch (RFC 7396), for example '{"spec":{"type":"mobile"}}'; null
+    /// deletes a member. - reads it from standard input: best for secrets
     #[arg(short, long, value_name = "JSON|-")]
     pub patch: String,
     /// Also when somebody else changed the document in between
@@ -66,7 +66,8 @@ fn parse(text: &str) -> Result<Value, CliError> {
     if text.len() as u64 > MAX_BYTES {
         return Err(CliError::Invalid("the patch is larger than 1 MiB".to_owned()));
     }
-    let patch = json::parse(text.as_bytes()).map_err(|fault| CliError::Invalid(format!("the patch: {fault}")))?;
+    let patch = json::parse(text.as_bytes())
+        .map_err(|fault| CliError::Invalid(format!("the patch: {fault}")))?;
     let Some(members) = patch.as_object() else {
         return Err(CliError::Invalid("the patch is no JSON object".to_owned()));
     };
@@ -76,7 +77,8 @@ fn parse(text: &str) -> Result<Value, CliError> {
             None => format!("{{\"spec\":{{\"{other}\":…}}}}"),
         };
         return Err(CliError::Invalid(format!(
-            "the patch changes {other:?}; a patch changes labels, annotations and spec; did you mean {meant}?"
+            "the patch changes {other:?}; a patch changes labels, annotations and spec; did you \
+             mean {meant}?"
         )));
     }
     Ok(patch)

@@ -41,13 +41,7 @@ impl Refusal {
     /// A problem that came within a stream.
     #[must_use]
     pub fn of(server: &str, status: u16, problem: Value) -> Self {
-        Self {
-            server: server.to_owned(),
-            status,
-            problem,
-            sources: Vec::new(),
-            hints: Vec::new(),
-        }
+        Self { server: server.to_owned(), status, problem, sources: Vec::new(), hints: Vec::new() }
     }
 
     /// The error code; empty where it was not BlazeConfig that answered.
@@ -73,7 +67,8 @@ impl Refusal {
         Exit::of_status(status)
     }
 
-    /// Says where the documents of the request come from: in the text, and as `source` in the problem's errors.
+    /// Says where the documents of the request come from: in the text, and as `source` in the
+    /// problem's errors.
     #[must_use]
     pub fn with_sources(mut self, sources: Vec<String>) -> Self {
         if let Some(Value::Array(errors)) = self.problem.get_mut("errors") {
@@ -103,20 +98,29 @@ impl Refusal {
         };
         let now = self.number("revision");
         match self.code() {
-            "permission_denied" => Some("the token's roles or layer do not allow it: `blaze token inspect`".to_owned()),
+            "permission_denied" => {
+                Some("the token's roles or layer do not allow it: `blaze token inspect`".to_owned())
+            }
             "precondition_failed" | "revision_conflict" => Some(match now {
                 Some(revision) => {
-                    format!("it was changed in between and is at revision {revision} now: look, then try again")
+                    format!(
+                        "it was changed in between and is at revision {revision} now: look, then \
+                         try again"
+                    )
                 }
                 None => "it was changed in between: look, then try again".to_owned(),
             }),
-            "revision_trimmed" => self
-                .number("oldest_revision")
-                .map(|oldest| format!("what is kept of the history begins after revision {oldest}")),
+            "revision_trimmed" => self.number("oldest_revision").map(|oldest| {
+                format!("what is kept of the history begins after revision {oldest}")
+            }),
             "signing_disabled" => Some("sign it yourself: --key-file FILE --alg ALG".to_owned()),
-            "rollout_active" => Some("`blaze get rollouts` shows it; promote or abort it first".to_owned()),
+            "rollout_active" => {
+                Some("`blaze get rollouts` shows it; promote or abort it first".to_owned())
+            }
             "rate_limited" | "overloaded" => Some(after("try again later")),
-            "store_unavailable" | "shutting_down" => Some(format!("nothing was changed; {}", after("try again later"))),
+            "store_unavailable" | "shutting_down" => {
+                Some(format!("nothing was changed; {}", after("try again later")))
+            }
             _ => None,
         }
     }
@@ -133,7 +137,10 @@ fn foreign(status: u16, body: &[u8]) -> Value {
         "type": "about:blank",
         "title": "Something between, or another program, answered.",
         "status": status,
-        "detail": format!("HTTP status {status} without a problem of BlazeConfig: {}", printable(&shown)),
+        "detail": format!(
+            "HTTP status {status} without a problem of BlazeConfig: {}",
+            printable(&shown),
+        ),
     })
 }
 
@@ -160,7 +167,9 @@ impl fmt::Display for Refusal {
             write!(f, "\n  {hint}")?;
         }
         if self.problem.get("applied").and_then(Value::as_str) == Some("unknown") {
-            f.write_str("\n  Whether the change took effect is not known: look before you try again.")?;
+            f.write_str(
+                "\n  Whether the change took effect is not known: look before you try again.",
+            )?;
         }
         let page = member(&self.problem, "type");
         if page.starts_with('/') {
@@ -213,8 +222,10 @@ mod tests {
     fn a_refusal_says_what_where_and_what_to_do() {
         let refusal = refusal(
             412,
-            &json!({"type": "/docs/errors/precondition_failed", "title": "The document has another revision.", "status": 412,
-                "detail": "Node/robot-1 is at revision 420", "instance": "/api/v1/nodes/robot-1", "code": "precondition_failed",
+            &json!({"type": "/docs/errors/precondition_failed", "title": "The document has another \
+                revision.", "status": 412,
+                "detail": "Node/robot-1 is at revision 420", "instance": "/api/v1/nodes/robot-1",
+                "code": "precondition_failed",
                 "request_id": "r-1", "applied": "no", "revision": 420}),
         );
         assert_eq!(refusal.exit(), Exit::Conflict);
@@ -228,14 +239,26 @@ mod tests {
 
     #[test]
     fn faults_are_listed_with_file_and_line() {
-        let problem = json!({"type": "/docs/errors/reference_not_found", "title": "A document that is referred to does not exist.",
-            "status": 422, "detail": "/spec/layer: no layer edgee (and 1 more)", "code": "reference_not_found", "applied": "no",
+        let problem = json!({"type": "/docs/errors/reference_not_found", "title": "A document that \
+            is referred to does not exist.",
+            "status": 422, "detail": "/spec/layer: no layer edgee (and 1 more)",
+            "code": "reference_not_found", "applied": "no",
             "errors": [
-                {"pointer": "/spec/layer", "code": "reference_not_found", "detail": "no layer edgee", "document": 1},
-                {"pointer": "/spec/type", "code": "validation_failed", "detail": "is not static, gateway or mobile", "document": 0},
+                {
+                    "pointer": "/spec/layer",
+                    "code": "reference_not_found",
+                    "detail": "no layer edgee",
+                    "document": 1,
+                },
+                {
+                    "pointer": "/spec/type",
+                    "code": "validation_failed",
+                    "detail": "is not static, gateway or mobile",
+                    "document": 0,
+                },
                 {"pointer": "", "code": "validation_failed", "detail": "x", "document": 9}]});
-        let refusal =
-            refusal(422, &problem).with_sources(vec!["a.yaml:1".to_owned(), "a.yaml:7 (document 2)".to_owned()]);
+        let refusal = refusal(422, &problem)
+            .with_sources(vec!["a.yaml:1".to_owned(), "a.yaml:7 (document 2)".to_owned()]);
         assert_eq!(refusal.exit(), Exit::Invalid);
         assert_eq!(
             refusal.to_string(),
@@ -251,8 +274,13 @@ mod tests {
 
     #[test]
     fn an_unknown_outcome_says_so() {
-        let problem =
-            json!({"code": "outcome_unknown", "title": "t", "detail": "d", "status": 503, "applied": "unknown"});
+        let problem = json!({
+            "code": "outcome_unknown",
+            "title": "t",
+            "detail": "d",
+            "status": 503,
+            "applied": "unknown",
+        });
         let refusal = refusal(503, &problem);
         assert_eq!(refusal.exit(), Exit::Failed);
         assert!(refusal.to_string().contains("look before you try again"), "{refusal}");
@@ -274,16 +302,17 @@ mod tests {
 
     #[test]
     fn many_faults_are_cut() {
-        let errors: Vec<Value> = (0..30)
-            .map(|n| json!({"pointer": format!("/{n}"), "detail": "x"}))
-            .collect();
-        let problem = json!({"code": "validation_failed", "title": "t", "detail": "d", "errors": errors});
+        let errors: Vec<Value> =
+            (0..30).map(|n| json!({"pointer": format!("/{n}"), "detail": "x"})).collect();
+        let problem =
+            json!({"code": "validation_failed", "title": "t", "detail": "d", "errors": errors});
         assert!(refusal(422, &problem).to_string().contains("\n  and 10 more"));
     }
 
     #[test]
     fn a_problem_in_a_stream_has_its_own_status() {
-        let problem = json!({"code": "unauthenticated", "title": "t", "detail": "d", "status": 401});
+        let problem =
+            json!({"code": "unauthenticated", "title": "t", "detail": "d", "status": 401});
         assert_eq!(Refusal::of(SERVER, 0, problem).exit(), Exit::NotAllowed);
         let slow = json!({"code": "watch_too_slow", "title": "t", "detail": "d"});
         assert_eq!(Refusal::of(SERVER, 0, slow).exit(), Exit::Failed);

@@ -105,18 +105,16 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
                         note(format, "there are no roll-outs");
                         return Ok(Exit::Done);
                     }
-                    let layout = Layout {
-                        wide: false,
-                        width: terminal_width(),
-                        now_ms: now_ms(),
-                    };
+                    let layout = Layout { wide: false, width: terminal_width(), now_ms: now_ms() };
                     print(&listing.into_json(), format, |listing| {
                         tables::documents(Kind::Rollout, list(listing, "items"), layout)
                     })
                 }
             }
         }
-        RolloutCommand::Promote(options) => act(&options.server, &options.key, "promote", &json!({}), format).await,
+        RolloutCommand::Promote(options) => {
+            act(&options.server, &options.key, "promote", &json!({}), format).await
+        }
         RolloutCommand::Abort(options) => {
             let body = json!({ "reason": options.reason });
             act(&options.server, &options.key, "abort", &body, format).await
@@ -128,11 +126,19 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
 fn with_other_name(error: CliError, document: &Value) -> CliError {
     let name = member(document, "name");
     error.hinted("already_exists", &format!(
-        "a roll-out that has begun is not replaced: give this one another name; or end that one with `blaze rollout promote {name}` or `blaze rollout abort {name}`, and delete it with `blaze delete rollout {name}`"
+        "a roll-out that has begun is not replaced: give this one another name; or end that one \
+         with `blaze rollout promote {name}` or `blaze rollout abort {name}`, and delete it with \
+         `blaze delete rollout {name}`"
     ))
 }
 
-async fn act(server: &ServerOptions, key: &Key, action: &str, body: &Value, format: Format) -> Result<Exit, CliError> {
+async fn act(
+    server: &ServerOptions,
+    key: &Key,
+    action: &str,
+    body: &Value,
+    format: Format,
+) -> Result<Exit, CliError> {
     let client = Client::of(server)?;
     let call = Call::post(format!("{}/{action}", document_path(key)), body);
     let document = client.send_about(key, &call).await?.body;
@@ -143,7 +149,9 @@ async fn act(server: &ServerOptions, key: &Key, action: &str, body: &Value, form
 fn one_rollout(file: &std::path::Path) -> Result<Value, CliError> {
     let mut documents = files::read(&[file.to_owned()])?;
     match documents.pop() {
-        Some(document) if documents.is_empty() && document.key.kind() == Kind::Rollout => Ok(clean(document.value)),
+        Some(document) if documents.is_empty() && document.key.kind() == Kind::Rollout => {
+            Ok(clean(document.value))
+        }
         Some(document) => {
             let what = if documents.is_empty() {
                 format!("it is {}", name_of(&document.key))
@@ -198,8 +206,11 @@ mod tests {
 
     #[test]
     fn a_status_says_phase_target_and_canaries() {
-        let document = json!({"kind": "Rollout", "name": "slower", "spec": {"target": {"kind": "Service", "name": "slam"}},
-            "status": {"phase": "failed", "canaries": [{"node": "robot-1", "phase": "failed", "revision": 431, "reason": "unhealthy"}]}});
+        let document = json!({"kind": "Rollout", "name": "slower",
+            "spec": {"target": {"kind": "Service", "name": "slam"}},
+            "status": {"phase": "failed",
+                "canaries": [{"node": "robot-1", "phase": "failed", "revision": 431,
+                "reason": "unhealthy"}]}});
         assert_eq!(
             status(&document),
             "slower is failed; its change of service/slam is taken back\n\
@@ -207,15 +218,9 @@ mod tests {
              robot-1  failed       431  unhealthy\n"
         );
         for (phase, expected) in [
-            (
-                "canary",
-                "slower is canary; it tries a change of service/slam on its canary nodes\n",
-            ),
+            ("canary", "slower is canary; it tries a change of service/slam on its canary nodes\n"),
             ("promoted", "slower is promoted; its change is part of service/slam\n"),
-            (
-                "aborted",
-                "slower is aborted; its change of service/slam is taken back\n",
-            ),
+            ("aborted", "slower is aborted; its change of service/slam is taken back\n"),
         ] {
             let document = json!({"name": "slower", "spec": {"target": {"kind": "Service", "name": "slam"}},
                 "status": {"phase": phase, "canaries": []}});
@@ -225,7 +230,9 @@ mod tests {
 
     #[tokio::test]
     async fn one_that_exists_is_ended_or_the_new_one_has_another_name() {
-        let stub = Stub::start(|_, _| Reply::problem(409, "already_exists", "Rollout/slower exists")).await;
+        let stub =
+            Stub::start(|_, _| Reply::problem(409, "already_exists", "Rollout/slower exists"))
+                .await;
         let document = json!({"kind": "Rollout", "name": "slower", "spec": {}});
         let call = Call::post(collection_path(Kind::Rollout, None), &document);
         let error = stub.client().send(&call).await.unwrap_err();

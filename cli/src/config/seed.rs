@@ -1,4 +1,5 @@
-//! Documents that a main service within this process begins with, and changes to it, over the same REST that everybody has.
+//! Documents that a main service within this process begins with, and changes to it, over the same
+//! REST that everybody has.
 
 use std::net::SocketAddr;
 
@@ -26,7 +27,11 @@ pub(crate) fn client(rest: SocketAddr) -> Result<Client, CliError> {
 ///
 /// # Errors
 /// As [`Client::send`]; what is wrong with a source is told with its file and line.
-pub(crate) async fn apply(rest: SocketAddr, own: &[Value], sources: &[Source]) -> Result<u64, CliError> {
+pub(crate) async fn apply(
+    rest: SocketAddr,
+    own: &[Value],
+    sources: &[Source],
+) -> Result<u64, CliError> {
     let client = client(rest)?;
     let mut missing = Vec::new();
     let mut revision = 0;

@@ -138,16 +138,13 @@ mod tests {
     }
 
     fn event(name: &str, id: &str, data: &str) -> Event {
-        Event {
-            name: name.to_owned(),
-            id: id.to_owned(),
-            data: data.to_owned(),
-        }
+        Event { name: name.to_owned(), id: id.to_owned(), data: data.to_owned() }
     }
 
     #[test]
     fn the_stream_of_the_contract_is_read() {
-        let text = b"retry: 2731\nid: 413\nevent: change\ndata: {\"revision\":413}\n\nid: 419\nevent: bookmark\ndata: {\"revision\":419}\n\n";
+        let text =
+            b"retry: 2731\nid: 413\nevent: change\ndata: {\"revision\":413}\n\nid: 419\nevent: bookmark\ndata: {\"revision\":419}\n\n";
         let (events, parser) = read(&[text]);
         assert_eq!(
             events,
@@ -165,10 +162,7 @@ mod tests {
             // Several lines of data, one space is taken away.
             ("data: a\ndata:  b\ndata\n\n", vec![event("message", "", "a\n b\n")]),
             // Comments, unknown fields, and an event without data.
-            (
-                ": hello\nfoo: bar\nevent: x\n\ndata: y\n\n",
-                vec![event("message", "", "y")],
-            ),
+            (": hello\nfoo: bar\nevent: x\n\ndata: y\n\n", vec![event("message", "", "y")]),
             // The id stays, also that of an event without data.
             (
                 "id: 7\n\ndata: a\n\ndata: b\n\n",
@@ -220,7 +214,8 @@ mod tests {
         fn chunks_do_not_matter(
             parts in prop::collection::vec(
                 prop::sample::select(vec![
-                    "data", ": ", ":", " ", "\n", "\r", "\r\n", "\n\n", "id", "event", "retry: 5", "ä", "\u{feff}", "x", "7", "\0",
+                    "data", ": ", ":", " ", "\n", "\r", "\r\n", "\n\n", "id", "event", "retry: 5",
+                    "ä", "\u{feff}", "x", "7", "\0",
                 ]),
                 0..60,
             ),
@@ -230,7 +225,8 @@ mod tests {
             let mut places: Vec<usize> = cuts.into_iter().map(|cut| cut.min(text.len())).collect();
             places.extend([0, text.len()]);
             places.sort_unstable();
-            let chunks: Vec<&[u8]> = places.windows(2).map(|pair| &text[pair[0]..pair[1]]).collect();
+            let chunks: Vec<&[u8]> =
+                places.windows(2).map(|pair| &text[pair[0]..pair[1]]).collect();
             let (whole, one) = read(&[&text]);
             let (cut, many) = read(&chunks);
             prop_assert_eq!(whole, cut);

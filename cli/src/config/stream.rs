@@ -1,4 +1,5 @@
-//! A watch that does not end: it connects again by itself and goes on behind the last event that it saw.
+//! A watch that does not end: it connects again by itself and goes on behind the last event that it
+//! saw.
 //!
 //! ```text
 //! connect ─► events ─┬─ change, bookmark ─► told; the id moves on
@@ -45,7 +46,8 @@ pub(crate) enum Told {
 pub(crate) enum Lost {
     /// The history does not reach back that far any more.
     Trimmed,
-    /// The store is not there yet: another database, a restored backup, a slip in the number. With the store's revision.
+    /// The store is not there yet: another database, a restored backup, a slip in the number. With
+    /// the store's revision.
     Ahead(Option<u64>),
 }
 
@@ -102,10 +104,12 @@ impl<'c> Watcher<'c> {
         self.disconnect();
     }
 
-    /// The next thing that happened. It waits as long as nothing does; broken connections are made anew.
+    /// The next thing that happened. It waits as long as nothing does; broken connections are made
+    /// anew.
     ///
     /// # Errors
-    /// [`CliError`] when the first connection fails, or the server refuses (a token that has run out, a bad filter).
+    /// [`CliError`] when the first connection fails, or the server refuses (a token that has run
+    /// out, a bad filter).
     pub(crate) async fn next(&mut self) -> Result<Told, CliError> {
         loop {
             if let Some(event) = self.told.pop_front() {
@@ -125,7 +129,8 @@ impl<'c> Watcher<'c> {
                     Ok(()) => None,
                     Err(too_large) => Some(too_large.to_string()),
                 },
-                // Streams end now and then, so that a load balancer can spread them anew: no trouble.
+                // Streams end now and then, so that a load balancer can spread them anew: no
+                // trouble.
                 Ok(Ok(None)) => Some(String::new()),
                 Ok(Err(error)) => Some(reason(&error)),
                 Err(_) => Some(format!("nothing came for {} s", SILENCE.as_secs())),
@@ -192,7 +197,8 @@ impl<'c> Watcher<'c> {
                 if matches!(refusal.code(), "revision_trimmed" | "revision_unknown") {
                     return Ok(Some(Told::Relist(Lost::of(&refusal))));
                 }
-                // A token that has run out may have been renewed in its file; if not, connecting says so.
+                // A token that has run out may have been renewed in its file; if not, connecting
+                // says so.
                 let code = refusal.code().to_owned();
                 self.trouble(&code);
                 Ok(None)
@@ -207,7 +213,8 @@ impl<'c> Watcher<'c> {
         self.told.clear();
     }
 
-    /// The pause before the next connection: as the server says, doubled by each failure, and not the same for all.
+    /// The pause before the next connection: as the server says, doubled by each failure, and not
+    /// the same for all.
     fn pause(&self) -> Duration {
         let longer = self.retry.saturating_mul(1 << self.failures.min(5));
         longer.min(LONGEST).mul_f64(rand::random_range(0.5..=1.0))
@@ -223,8 +230,8 @@ impl<'c> Watcher<'c> {
     }
 }
 
-/// Gives `take` each change of the commits after one revision up to another, with its revision. Whether the history reaches
-/// back that far.
+/// Gives `take` each change of the commits after one revision up to another, with its revision.
+/// Whether the history reaches back that far.
 ///
 /// # Errors
 /// As [`Watcher::next`], and whatever `take` says.

@@ -6,7 +6,9 @@ use crate::config::stub::{Asked, Reply, Stub};
 const PATH: &str = "/api/v1/watch";
 
 fn change(revision: u64) -> String {
-    format!("retry: 1\nid: {revision}\nevent: change\ndata: {{\"revision\":{revision},\"changes\":[]}}\n\n")
+    format!(
+        "retry: 1\nid: {revision}\nevent: change\ndata: {{\"revision\":{revision},\"changes\":[]}}\n\n"
+    )
 }
 
 fn bookmark(revision: u64) -> String {
@@ -76,7 +78,9 @@ async fn a_watch_from_now_on_remembers_where_now_was() {
 async fn what_is_trimmed_away_is_listed_anew() {
     let stub = Stub::start(|asked: &Asked, before| match before {
         0 => Reply::Events(format!("{}{}", change(5), trouble("revision_trimmed"))),
-        _ if asked.header("last-event-id").is_some() => Reply::problem(410, "revision_trimmed", "gone"),
+        _ if asked.header("last-event-id").is_some() => {
+            Reply::problem(410, "revision_trimmed", "gone")
+        }
         _ => Reply::Events(change(101)),
     })
     .await;
@@ -96,7 +100,13 @@ async fn what_is_trimmed_away_is_listed_anew() {
 #[tokio::test]
 async fn a_watch_ahead_of_the_store_says_where_the_store_is() {
     let stub = Stub::start(|_, _| {
-        let problem = json!({"code": "revision_unknown", "title": "t", "detail": "d", "status": 410, "revision": 12});
+        let problem = json!({
+            "code": "revision_unknown",
+            "title": "t",
+            "detail": "d",
+            "status": 410,
+            "revision": 12,
+        });
         Reply::Full(410, Vec::new(), problem.to_string())
     })
     .await;

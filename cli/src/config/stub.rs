@@ -52,11 +52,7 @@ pub(crate) enum Reply {
 
 impl Reply {
     pub(crate) fn json(value: &Value) -> Self {
-        Self::Full(
-            200,
-            vec![("content-type", "application/json".to_owned())],
-            value.to_string(),
-        )
+        Self::Full(200, vec![("content-type", "application/json".to_owned())], value.to_string())
     }
 
     /// With a revision in `Blaze-Revision` and, for a document, in `ETag`.
@@ -71,8 +67,10 @@ impl Reply {
 
     pub(crate) fn problem(status: u16, code: &str, detail: &str) -> Self {
         let problem = json!({
-            "type": format!("/docs/errors/{code}"), "title": "Title.", "status": status, "detail": detail,
-            "code": code, "request_id": "r-1", "applied": if code == "outcome_unknown" { "unknown" } else { "no" },
+            "type": format!("/docs/errors/{code}"), "title": "Title.", "status": status,
+            "detail": detail,
+            "code": code, "request_id": "r-1",
+            "applied": if code == "outcome_unknown" { "unknown" } else { "no" },
         });
         Self::Full(
             status,
@@ -91,7 +89,9 @@ pub(crate) struct Stub {
 
 impl Stub {
     /// Starts it. `answer` gets each request and how many came before it.
-    pub(crate) async fn start(answer: impl Fn(&Asked, usize) -> Reply + Send + Sync + 'static) -> Self {
+    pub(crate) async fn start(
+        answer: impl Fn(&Asked, usize) -> Reply + Send + Sync + 'static,
+    ) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let url = format!("http://{}", listener.local_addr().unwrap());
         let asked = Arc::new(Mutex::new(Vec::new()));
@@ -109,11 +109,7 @@ impl Stub {
                 write(&mut stream, reply).await;
             }
         });
-        Self {
-            url,
-            asked,
-            _task: task,
-        }
+        Self { url, asked, _task: task }
     }
 
     /// What it was asked so far.
@@ -167,12 +163,7 @@ async fn read(stream: &mut TcpStream) -> Option<Asked> {
             return None;
         }
     }
-    Some(Asked {
-        method,
-        target,
-        headers,
-        body: String::from_utf8(body).unwrap(),
-    })
+    Some(Asked { method, target, headers, body: String::from_utf8(body).unwrap() })
 }
 
 async fn write(stream: &mut TcpStream, reply: Reply) {
@@ -189,7 +180,9 @@ async fn write(stream: &mut TcpStream, reply: Reply) {
             format!("{text}\r\n{body}")
         }
         Reply::Events(events) => {
-            format!("HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-type: text/event-stream\r\n\r\n{events}")
+            format!(
+                "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-type: text/event-stream\r\n\r\n{events}"
+            )
         }
     };
     // A client that has gone is no concern of the test.

@@ -19,7 +19,8 @@ pub(crate) struct Layout {
 
 const NAME: Column<'_, Value> = ("NAME", Align::Left, &|document| member(document, "name"));
 
-const LAYER: &[Column<'_, Value>] = &[NAME, ("KIND", Align::Left, &|document| spec(document, "kind"))];
+const LAYER: &[Column<'_, Value>] =
+    &[NAME, ("KIND", Align::Left, &|document| spec(document, "kind"))];
 
 const NODE: &[Column<'_, Value>] = &[
     NAME,
@@ -45,9 +46,7 @@ const INSTANCE: &[Column<'_, Value>] = &[
 const ROLLOUT: &[Column<'_, Value>] = &[
     NAME,
     ("TARGET", Align::Left, &target),
-    ("PHASE", Align::Left, &|document| {
-        cell(document.pointer("/status/phase"))
-    }),
+    ("PHASE", Align::Left, &|document| cell(document.pointer("/status/phase"))),
     ("CANARIES", Align::Right, &|document| {
         let canaries = document.pointer("/status/canaries").and_then(Value::as_array);
         canaries.map_or_else(|| "-".to_owned(), |canaries| canaries.len().to_string())
@@ -59,11 +58,11 @@ const WIDE_NODE: &[Column<'_, Value>] = &[
     ("RESOURCES", Align::Left, &resources),
 ];
 
-const WIDE_SERVICE: &[Column<'_, Value>] = &[("DESCRIPTION", Align::Left, &|document| spec(document, "description"))];
+const WIDE_SERVICE: &[Column<'_, Value>] =
+    &[("DESCRIPTION", Align::Left, &|document| spec(document, "description"))];
 
-const WIDE_ROLLOUT: &[Column<'_, Value>] = &[("CANARY", Align::Left, &|document| {
-    cell(document.pointer("/spec/canary/node_selector"))
-})];
+const WIDE_ROLLOUT: &[Column<'_, Value>] =
+    &[("CANARY", Align::Left, &|document| cell(document.pointer("/spec/canary/node_selector")))];
 
 /// The columns of a kind, and those that a wide table has beside them.
 fn columns_of(kind: Kind) -> [&'static [Column<'static, Value>]; 2] {
@@ -109,10 +108,8 @@ fn spec(document: &Value, name: &str) -> String {
 /// Where an instance runs: `node/robot-1`, `layer/edge`, or anywhere.
 pub(crate) fn placement(document: &Value) -> String {
     for kind in ["node", "layer"] {
-        if let Some(name) = document
-            .get("spec")
-            .and_then(|spec| spec.get(kind))
-            .and_then(Value::as_str)
+        if let Some(name) =
+            document.get("spec").and_then(|spec| spec.get(kind)).and_then(Value::as_str)
         {
             return format!("{kind}/{}", super::text::printable(name));
         }
@@ -207,7 +204,10 @@ mod tests {
             ),
             (
                 Kind::Service,
-                json!({"name": "slam", "spec": {"layers": ["edge", "fog"], "schema": {"type": "object"}}}),
+                json!({
+                    "name": "slam",
+                    "spec": {"layers": ["edge", "fog"], "schema": {"type": "object"}},
+                }),
                 "NAME  LAYERS    SCHEMA  REVISION  AGE\nslam  edge,fog  yes          412   1h\n",
             ),
             (
@@ -217,7 +217,8 @@ mod tests {
             ),
             (
                 Kind::Rollout,
-                json!({"name": "slower", "spec": {"target": {"kind": "Instance", "service": "slam", "name": "0"}},
+                json!({"name": "slower",
+                    "spec": {"target": {"kind": "Instance", "service": "slam", "name": "0"}},
                     "status": {"phase": "canary", "canaries": [{}]}}),
                 "NAME    TARGET           PHASE   CANARIES  REVISION  AGE\nslower  instance/slam/0  canary         1       412   1h\n",
             ),
@@ -230,27 +231,23 @@ mod tests {
     fn wide_tables_tell_more() {
         let document = json!({"name": "robot-1", "labels": {"site": "lab", "canary": "true"},
             "spec": {"layer": "edge", "type": "mobile", "addresses": ["10.0.1.7"],
-                "resources": {"cpus": 8, "memory_bytes": 34_359_738_368_u64, "gpus": 1, "arch": "arm64"}}});
+                "resources": {"cpus": 8, "memory_bytes": 34_359_738_368_u64, "gpus": 1,
+                    "arch": "arm64"}}});
         let text = documents(Kind::Node, &[stamped(document)], WIDE);
         let mut lines = text.lines();
-        assert!(
-            lines
-                .next()
-                .unwrap()
-                .ends_with("ADDRESSES  RESOURCES                      LABELS                CHANGED  BY")
-        );
-        assert!(
-            lines
-                .next()
-                .unwrap()
-                .ends_with("10.0.1.7   8 CPU, 32.0 GiB, 1 GPU, arm64  site=lab,canary=true       1m  ops")
-        );
+        assert!(lines.next().unwrap().ends_with(
+            "ADDRESSES  RESOURCES                      LABELS                CHANGED  BY"
+        ));
+        assert!(lines.next().unwrap().ends_with(
+            "10.0.1.7   8 CPU, 32.0 GiB, 1 GPU, arm64  site=lab,canary=true       1m  ops"
+        ));
     }
 
     #[test]
     fn what_is_missing_is_a_dash_and_never_a_failure() {
         for kind in Kind::ALL {
-            let text = documents(*kind, &[json!({}), json!(7), json!({"spec": [], "status": 3})], WIDE);
+            let text =
+                documents(*kind, &[json!({}), json!(7), json!({"spec": [], "status": 3})], WIDE);
             assert_eq!(text.lines().count(), 4, "{text}");
         }
     }

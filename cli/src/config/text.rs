@@ -19,11 +19,10 @@ pub(crate) fn now_ms() -> i64 {
     i64::try_from(since.as_millis()).unwrap_or(i64::MAX)
 }
 
-/// A duration such as `500ms`, `30s`, `5m`, `24h`, `7d`; a bare number counts seconds. At most 400 days.
+/// A duration such as `500ms`, `30s`, `5m`, `24h`, `7d`; a bare number counts seconds. At most 400
+/// days.
 pub(crate) fn parse_duration(text: &str) -> Result<Duration, String> {
-    let split = text
-        .find(|c: char| !c.is_ascii_digit() && c != '.')
-        .unwrap_or(text.len());
+    let split = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
     let (number, unit) = text.split_at(split);
     let scale = match unit {
         "ms" => 0.001,
@@ -54,13 +53,8 @@ pub(crate) fn short_duration(seconds: i64) -> String {
 
 /// How long ago a time of the server was; a dash where there is none.
 pub(crate) fn age(time: Option<&Value>, now_ms: i64) -> String {
-    let then = time
-        .and_then(Value::as_str)
-        .and_then(|text| text.parse::<Timestamp>().ok());
-    then.map_or_else(
-        || "-".to_owned(),
-        |then| short_duration((now_ms - then.as_millis()) / 1_000),
-    )
+    let then = time.and_then(Value::as_str).and_then(|text| text.parse::<Timestamp>().ok());
+    then.map_or_else(|| "-".to_owned(), |then| short_duration((now_ms - then.as_millis()) / 1_000))
 }
 
 /// A text of the server without what could play tricks on a terminal.
@@ -76,11 +70,7 @@ pub(crate) fn printable_lines(text: &str) -> String {
 
 /// A member that is text, made printable; empty where there is none.
 pub(crate) fn member(value: &Value, name: &str) -> String {
-    value
-        .get(name)
-        .and_then(Value::as_str)
-        .map(printable)
-        .unwrap_or_default()
+    value.get(name).and_then(Value::as_str).map(printable).unwrap_or_default()
 }
 
 /// The entries of a member that is a list; none where there is none.
@@ -112,7 +102,9 @@ pub(crate) fn cell(value: Option<&Value>) -> String {
         None | Some(Value::Null) => "-".to_owned(),
         Some(Value::String(text)) if text.is_empty() => "-".to_owned(),
         Some(Value::String(text)) => shortened(&printable(text)),
-        Some(Value::Array(items)) if items.iter().all(|item| !item.is_array() && !item.is_object()) => {
+        Some(Value::Array(items))
+            if items.iter().all(|item| !item.is_array() && !item.is_object()) =>
+        {
             let items: Vec<String> = items.iter().map(|item| cell(Some(item))).collect();
             shortened(&joined(&items, ","))
         }
@@ -134,11 +126,7 @@ fn shortened(text: &str) -> String {
 
 /// `1 document`, `2 documents`.
 pub(crate) fn count(number: usize, one: &str) -> String {
-    if number == 1 {
-        format!("1 {one}")
-    } else {
-        format!("{number} {one}s")
-    }
+    if number == 1 { format!("1 {one}") } else { format!("{number} {one}s") }
 }
 
 /// Tells people something on stderr. With JSON or YAML nothing but failures stands there.
@@ -149,7 +137,11 @@ pub(crate) fn note(format: Format, text: &str) {
 }
 
 /// Prints a value: as JSON or YAML, or what `table` makes of it for people.
-pub(crate) fn print(value: &Value, format: Format, table: impl FnOnce(&Value) -> String) -> Result<Exit, CliError> {
+pub(crate) fn print(
+    value: &Value,
+    format: Format,
+    table: impl FnOnce(&Value) -> String,
+) -> Result<Exit, CliError> {
     output::print(&match format {
         Format::Table => table(value),
         Format::Json => json_pretty(value)?,

@@ -1,4 +1,5 @@
-//! TLS as the command line sees it: which authorities are trusted, which certificate is shown, and what to do when it fails.
+//! TLS as the command line sees it: which authorities are trusted, which certificate is shown, and
+//! what to do when it fails.
 
 use std::path::Path;
 
@@ -10,8 +11,8 @@ use super::files::small;
 use crate::exit::CliError;
 
 /// How a certificate for clients is given.
-const GIVE_ONE: &str =
-    "--client-cert FILE --client-key FILE, BLAZE_CLIENT_CERT and BLAZE_CLIENT_KEY, or a context that has them";
+const GIVE_ONE: &str = "--client-cert FILE --client-key FILE, BLAZE_CLIENT_CERT and \
+    BLAZE_CLIENT_KEY, or a context that has them";
 
 /// The authorities in a file.
 ///
@@ -24,7 +25,8 @@ pub(super) fn authorities(file: &Path) -> Result<Vec<Certificate>, CliError> {
 /// The certificate to show, with its key.
 ///
 /// # Errors
-/// [`CliError::Failed`] when a file cannot be read, [`CliError::Invalid`] where there is no certificate or key.
+/// [`CliError::Failed`] when a file cannot be read, [`CliError::Invalid`] where there is no
+/// certificate or key.
 pub(super) fn identity(files: &ClientCertificate) -> Result<Identity, CliError> {
     let mut pem = small(&files.cert_file, "the client certificate")?;
     certificates(&files.cert_file, &pem)?;
@@ -40,7 +42,8 @@ pub(super) fn identity(files: &ClientCertificate) -> Result<Identity, CliError> 
                 key_file.display()
             ),
             None => format!(
-                "{} holds no private key in PEM form without a password: name its file with --client-key",
+                "{} holds no private key in PEM form without a password: name its file with \
+                 --client-key",
                 files.cert_file.display()
             ),
         })
@@ -50,10 +53,9 @@ pub(super) fn identity(files: &ClientCertificate) -> Result<Identity, CliError> 
 fn certificates(file: &Path, pem: &[u8]) -> Result<Vec<Certificate>, CliError> {
     match Certificate::from_pem_bundle(pem) {
         Ok(certificates) if !certificates.is_empty() => Ok(certificates),
-        Ok(_) | Err(_) => Err(CliError::Invalid(format!(
-            "{} holds no certificate in PEM form",
-            file.display()
-        ))),
+        Ok(_) | Err(_) => {
+            Err(CliError::Invalid(format!("{} holds no certificate in PEM form", file.display())))
+        }
     }
 }
 
@@ -79,8 +81,8 @@ pub(super) fn fault(error: &reqwest::Error) -> Option<&Error> {
     None
 }
 
-/// Whether the server ended the handshake because of the client's certificate. It hears so when it has begun to send already,
-/// but nothing of that was looked at.
+/// Whether the server ended the handshake because of the client's certificate. It hears so when it
+/// has begun to send already, but nothing of that was looked at.
 pub(super) fn is_refused(fault: &Error) -> bool {
     asks_for_one(fault) || refuses_ours(fault)
 }
@@ -122,10 +124,14 @@ pub(super) fn advice(fault: &Error, endpoint: &Endpoint) -> Option<String> {
     if is_refused(fault) {
         return Some(match shown {
             // It may have another reason.
-            None if matches!(fault, Error::AlertReceived(AlertDescription::HandshakeFailure)) => perhaps(),
+            None if matches!(fault, Error::AlertReceived(AlertDescription::HandshakeFailure)) => {
+                perhaps()
+            }
             None => format!("The server wants to see a certificate of its clients: {GIVE_ONE}."),
             Some(files) => format!(
-                "The server does not accept the client certificate {}: an authority of its tls.client_ca_file must have signed it, for clients, and it must not have run out.",
+                "The server does not accept the client certificate {}: an authority of its \
+                 tls.client_ca_file must have signed it, for clients, and it must not have run \
+                 out.",
                 files.cert_file.display()
             ),
         });
@@ -134,19 +140,27 @@ pub(super) fn advice(fault: &Error, endpoint: &Endpoint) -> Option<String> {
         return Some(OTHER_NAME.to_owned());
     }
     if matches!(fault, Error::InvalidMessage(_)) {
-        return Some("What answers there does not speak TLS: if it is the right one, name it with http://.".to_owned());
+        return Some(
+            "What answers there does not speak TLS: if it is the right one, name it with http://."
+                .to_owned(),
+        );
     }
     if matches!(
         fault,
         Error::PeerIncompatible(_)
-            | Error::AlertReceived(AlertDescription::ProtocolVersion | AlertDescription::InsufficientSecurity)
+            | Error::AlertReceived(
+                AlertDescription::ProtocolVersion | AlertDescription::InsufficientSecurity
+            )
     ) {
-        return Some("The server speaks no version of TLS that is taken here: 1.2 and 1.3 are.".to_owned());
+        return Some(
+            "The server speaks no version of TLS that is taken here: 1.2 and 1.3 are.".to_owned(),
+        );
     }
     None
 }
 
-const OTHER_NAME: &str = "The certificate is for another name: give --server the name or address that it was made for, or have it made for this one, too.";
+const OTHER_NAME: &str = "The certificate is for another name: give --server the name or address \
+    that it was made for, or have it made for this one, too.";
 
 fn of_the_servers_certificate(reason: &CertificateError) -> &'static str {
     if matches!(
@@ -154,11 +168,10 @@ fn of_the_servers_certificate(reason: &CertificateError) -> &'static str {
         CertificateError::NotValidForName | CertificateError::NotValidForNameContext { .. }
     ) {
         OTHER_NAME
-    } else if matches!(
-        reason,
-        CertificateError::Expired | CertificateError::ExpiredContext { .. }
-    ) {
-        "The server's certificate has run out and must be renewed there; or the clock of this machine is wrong."
+    } else if matches!(reason, CertificateError::Expired | CertificateError::ExpiredContext { .. })
+    {
+        "The server's certificate has run out and must be renewed there; or the clock of this \
+         machine is wrong."
     } else if matches!(
         reason,
         CertificateError::NotValidYet | CertificateError::NotValidYetContext { .. }
@@ -171,11 +184,7 @@ fn of_the_servers_certificate(reason: &CertificateError) -> &'static str {
 
 /// What to do when a connection over TLS broke off without a word.
 pub(super) fn broke_off(endpoint: &Endpoint) -> Option<String> {
-    if endpoint.is_tls() && endpoint.client_certificate.is_none() {
-        Some(perhaps())
-    } else {
-        None
-    }
+    if endpoint.is_tls() && endpoint.client_certificate.is_none() { Some(perhaps()) } else { None }
 }
 
 fn perhaps() -> String {
@@ -207,34 +216,18 @@ mod tests {
                 false,
                 "--client-cert FILE --client-key FILE",
             ),
-            (
-                Error::AlertReceived(AlertDescription::HandshakeFailure),
-                false,
-                "BLAZE_CLIENT_KEY",
-            ),
+            (Error::AlertReceived(AlertDescription::HandshakeFailure), false, "BLAZE_CLIENT_KEY"),
             (
                 Error::AlertReceived(AlertDescription::UnknownCA),
                 true,
                 "does not accept the client certificate client.pem",
             ),
-            (
-                CertificateError::UnknownIssuer.into(),
-                true,
-                "--ca-file FILE names the authority",
-            ),
+            (CertificateError::UnknownIssuer.into(), true, "--ca-file FILE names the authority"),
             (CertificateError::NotValidForName.into(), false, "for another name"),
             (CertificateError::Expired.into(), false, "has run out"),
             (CertificateError::NotValidYet.into(), false, "not valid yet"),
-            (
-                Error::InvalidMessage(rustls::InvalidMessage::InvalidContentType),
-                false,
-                "http://",
-            ),
-            (
-                Error::AlertReceived(AlertDescription::ProtocolVersion),
-                true,
-                "1.2 and 1.3",
-            ),
+            (Error::InvalidMessage(rustls::InvalidMessage::InvalidContentType), false, "http://"),
+            (Error::AlertReceived(AlertDescription::ProtocolVersion), true, "1.2 and 1.3"),
         ] {
             let advice = advice(&fault, &endpoint(with_certificate)).unwrap();
             assert!(advice.contains(expected), "{fault}: {advice}");
@@ -250,25 +243,16 @@ mod tests {
         let made = rcgen::generate_simple_self_signed(["client".to_owned()]).unwrap();
         let cert_file = directory.path().join("client.pem");
         let key_file = directory.path().join("client.key");
-        let both = ClientCertificate {
-            cert_file: cert_file.clone(),
-            key_file: Some(key_file.clone()),
-        };
-        let alone = ClientCertificate {
-            cert_file: cert_file.clone(),
-            key_file: None,
-        };
+        let both =
+            ClientCertificate { cert_file: cert_file.clone(), key_file: Some(key_file.clone()) };
+        let alone = ClientCertificate { cert_file: cert_file.clone(), key_file: None };
         let told = |files: &ClientCertificate| match identity(files) {
             Ok(_) => String::new(),
             Err(error) => format!("{} {error}", error.exit() as u8),
         };
         assert!(told(&both).starts_with("1 the client certificate"), "{}", told(&both));
         std::fs::write(&cert_file, made.signing_key.serialize_pem()).unwrap();
-        assert!(
-            told(&alone).contains("client.pem holds no certificate"),
-            "{}",
-            told(&alone)
-        );
+        assert!(told(&alone).contains("client.pem holds no certificate"), "{}", told(&alone));
         std::fs::write(&cert_file, made.cert.pem()).unwrap();
         assert!(
             told(&alone).starts_with("7 ") && told(&alone).contains("--client-key"),
@@ -276,11 +260,7 @@ mod tests {
             told(&alone)
         );
         std::fs::write(&key_file, "nothing").unwrap();
-        assert!(
-            told(&both).contains("client.key holds no private key"),
-            "{}",
-            told(&both)
-        );
+        assert!(told(&both).contains("client.key holds no private key"), "{}", told(&both));
         std::fs::write(&key_file, made.signing_key.serialize_pem()).unwrap();
         assert_eq!(told(&both), "");
         std::fs::write(

@@ -73,18 +73,14 @@ pub struct SigningOptions {
     #[arg(long, value_name = "FILE", requires = "alg", help_heading = "Without a server")]
     pub key_file: Option<PathBuf>,
     /// What the key is for: HS256, RS256 or EdDSA
-    #[arg(long, value_name = "ALG", value_parser = parse_algorithm, requires = "key_file", help_heading = "Without a server")]
+    #[arg(long, value_name = "ALG", value_parser = parse_algorithm, requires = "key_file",
+        help_heading = "Without a server")]
     pub alg: Option<Algorithm>,
     /// Id of the key in control_plane.auth.keys; needed where there are several
     #[arg(long, value_name = "ID", requires = "key_file", help_heading = "Without a server")]
     pub key_id: Option<String>,
     /// Issuer, as in control_plane.auth
-    #[arg(
-        long,
-        value_name = "ISSUER",
-        default_value = "blaze",
-        help_heading = "Without a server"
-    )]
+    #[arg(long, value_name = "ISSUER", default_value = "blaze", help_heading = "Without a server")]
     pub issuer: String,
     /// Audience, as in control_plane.auth
     #[arg(
@@ -110,7 +106,8 @@ pub struct RevokeOptions {
 /// Options of `blaze token inspect`.
 #[derive(Debug, Args)]
 pub struct InspectOptions {
-    /// File that holds the token, or - for standard input; without it the token that the other commands would send
+    /// File that holds the token, or - for standard input; without it the token that the other
+    /// commands would send
     #[arg(value_name = "FILE|-")]
     pub file: Option<PathBuf>,
     /// Which server.
@@ -139,7 +136,9 @@ pub(super) fn parse_life(text: &str) -> Result<Duration, String> {
 fn parse_id(text: &str) -> Result<String, String> {
     let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
     if text.is_empty() || text.len() > 128 || !text.chars().all(allowed) || text.starts_with('.') {
-        return Err("an id is 1 to 128 of A-Z a-z 0-9 . _ -, as `blaze token list` shows it".to_owned());
+        return Err(
+            "an id is 1 to 128 of A-Z a-z 0-9 . _ -, as `blaze token list` shows it".to_owned()
+        );
     }
     Ok(text.to_owned())
 }
@@ -181,15 +180,14 @@ pub(super) async fn run(command: &TokenCommand, format: Format) -> Result<Exit, 
         }
         TokenCommand::Inspect(options) => {
             let inspected = token_local::look_into(&token_of(options)?)?;
-            print(&inspected, format, |inspected| {
-                token_local::description(inspected, now_ms())
-            })
+            print(&inspected, format, |inspected| token_local::description(inspected, now_ms()))
         }
         TokenCommand::Keygen(options) => {
             let made = token_local::keygen(options.alg, &options.out)?;
             print(&made, format, |made| {
                 let public = made.get("public_file").and_then(Value::as_str);
-                let public = public.map_or_else(String::new, |file| format!(", its public part {file}"));
+                let public =
+                    public.map_or_else(String::new, |file| format!(", its public part {file}"));
                 format!("the key is {}{public}", options.out.display())
             })
         }
@@ -198,9 +196,7 @@ pub(super) async fn run(command: &TokenCommand, format: Format) -> Result<Exit, 
 
 async fn create(options: &CreateOptions) -> Result<Value, CliError> {
     if options.layer.is_none() && options.roles.iter().any(|role| role == "worker") {
-        return Err(CliError::Usage(
-            "a worker's token is for one layer: give --layer".to_owned(),
-        ));
+        return Err(CliError::Usage("a worker's token is for one layer: give --layer".to_owned()));
     }
     let wanted = Wanted {
         subject: &options.subject,
@@ -236,10 +232,7 @@ impl SigningOptions {
             key_file,
             algorithm,
             key_id: self.key_id.as_deref(),
-            realm: Realm {
-                issuer: self.issuer.clone(),
-                audience: self.audience.clone(),
-            },
+            realm: Realm { issuer: self.issuer.clone(), audience: self.audience.clone() },
             subject: wanted.subject,
             roles: wanted.roles,
             layer: wanted.layer.map(LayerName::as_str),
@@ -255,7 +248,8 @@ impl SigningOptions {
 /// As [`Client::send`], and [`CliError::Foreign`] for an answer without a token.
 pub(super) async fn ask_for(client: &Client, wanted: &Wanted<'_>) -> Result<Value, CliError> {
     let body = json!({
-        "subject": wanted.subject, "roles": wanted.roles, "layer": wanted.layer.map(LayerName::as_str),
+        "subject": wanted.subject, "roles": wanted.roles,
+        "layer": wanted.layer.map(LayerName::as_str),
         "expires_in_s": wanted.expires.as_secs(),
     });
     let answer = client.send(&Call::post(format!("{BASE}/tokens"), &body)).await?.body;
@@ -279,7 +273,9 @@ fn token_of(options: &InspectOptions) -> Result<String, CliError> {
         Some(file) => TokenSource::File(file.clone()),
         None => choose(&options.server, &Surroundings::of_process())?.token.ok_or_else(|| {
             CliError::Usage(
-                "there is no token: name its file, or give --token-file, BLAZE_TOKEN_FILE, BLAZE_TOKEN or a context".to_owned(),
+                "there is no token: name its file, or give --token-file, BLAZE_TOKEN_FILE, \
+                 BLAZE_TOKEN or a context"
+                    .to_owned(),
             )
         })?,
     };
@@ -309,7 +305,9 @@ mod tests {
     #[test]
     fn lives_and_ids_are_checked() {
         assert_eq!(parse_life("24h").unwrap(), Duration::from_secs(86_400));
-        assert!(parse_life("0s").is_err() && parse_life("366d").is_err() && parse_life("x").is_err());
+        assert!(
+            parse_life("0s").is_err() && parse_life("366d").is_err() && parse_life("x").is_err()
+        );
         assert!(parse_id("0197c1d2-7f3a").is_ok());
         for bad in ["", "..", "a/b", "a b", "ä"] {
             assert!(parse_id(bad).is_err(), "{bad}");
@@ -318,10 +316,10 @@ mod tests {
 
     #[test]
     fn tokens_are_listed_without_their_text() {
-        let tokens = [
-            json!({"id": "t1", "subject": "ops", "roles": ["operator", "viewer"], "layer": null,
-            "create_time": "2026-11-21T06:01:12.345Z", "expire_time": "2026-11-22T06:01:12.345Z", "revoke_time": null}),
-        ];
+        let tokens =
+            [json!({"id": "t1", "subject": "ops", "roles": ["operator", "viewer"], "layer": null,
+            "create_time": "2026-11-21T06:01:12.345Z", "expire_time": "2026-11-22T06:01:12.345Z",
+            "revoke_time": null})];
         assert_eq!(
             table(&tokens, 1_795_244_472_345, None),
             "ID  SUBJECT  ROLES            LAYER  AGE  UNTIL                     REVOKED\n\

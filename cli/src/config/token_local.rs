@@ -1,5 +1,5 @@
-//! What can be done with tokens without a server: sign, look into, make keys. The work is that of `blaze-auth`, which the
-//! server has too: what is signed here is taken there.
+//! What can be done with tokens without a server: sign, look into, make keys. The work is that of
+//! `blaze-auth`, which the server has too: what is signed here is taken there.
 
 use std::fs::OpenOptions;
 use std::io::Write as _;
@@ -7,7 +7,10 @@ use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use blaze_auth::{Algorithm, NewToken, Realm, generate_encryption_key, generate_key, inspect, random_id, sign_locally};
+use blaze_auth::{
+    Algorithm, NewToken, Realm, generate_encryption_key, generate_key, inspect, random_id,
+    sign_locally,
+};
 use blaze_domain::config::Timestamp;
 use serde_json::{Value, json};
 
@@ -49,7 +52,8 @@ pub(super) fn sign(token: &LocalToken<'_>, now_ms: i64) -> Result<Value, CliErro
     let text = sign_locally(&token.realm, &key, token.algorithm, token.key_id, &new)
         .map_err(|reason| CliError::Invalid(format!("{place}: {reason}")))?;
     Ok(json!({
-        "id": id, "token": text, "subject": token.subject, "roles": token.roles, "layer": token.layer,
+        "id": id, "token": text, "subject": token.subject, "roles": token.roles,
+        "layer": token.layer,
         "expire_time": Timestamp::from_millis(expires_s.saturating_mul(1_000)).to_string(),
     }))
 }
@@ -83,16 +87,12 @@ pub(super) fn description(inspected: &Value, now_ms: i64) -> String {
     let now_s = now_ms.div_euclid(1_000);
     let validity = match time("exp") {
         None => "without end: no server takes it".to_owned(),
-        Some(end) if end <= now_s => format!(
-            "ran out {} ago, at {}",
-            super::text::short_duration(now_s - end),
-            at(end)
-        ),
-        Some(end) => format!(
-            "runs out in {}, at {}",
-            super::text::short_duration(end - now_s),
-            at(end)
-        ),
+        Some(end) if end <= now_s => {
+            format!("ran out {} ago, at {}", super::text::short_duration(now_s - end), at(end))
+        }
+        Some(end) => {
+            format!("runs out in {}, at {}", super::text::short_duration(end - now_s), at(end))
+        }
     };
     let begin = match time("nbf") {
         Some(begin) if begin > now_s => format!(", not valid before {}", at(begin)),
@@ -139,9 +139,11 @@ impl FromStr for KeyUse {
     fn from_str(text: &str) -> Result<Self, String> {
         match text {
             "A256GCM" => Ok(Self::Secrets),
-            other => parse_algorithm(other)
-                .map(Self::Tokens)
-                .map_err(|_| format!("{text:?} is none of HS256, RS256, EdDSA (for tokens) and A256GCM (for secrets)")),
+            other => parse_algorithm(other).map(Self::Tokens).map_err(|_| {
+                format!(
+                    "{text:?} is none of HS256, RS256, EdDSA (for tokens) and A256GCM (for secrets)"
+                )
+            }),
         }
     }
 }
@@ -151,15 +153,13 @@ impl FromStr for KeyUse {
 /// # Errors
 /// In words.
 pub(super) fn parse_algorithm(text: &str) -> Result<Algorithm, String> {
-    let found = Algorithm::ALL
-        .iter()
-        .copied()
-        .find(|known| known.as_str().eq_ignore_ascii_case(text));
+    let found =
+        Algorithm::ALL.iter().copied().find(|known| known.as_str().eq_ignore_ascii_case(text));
     found.map_or_else(|| text.parse().map_err(|error| format!("algorithm {error}")), Ok)
 }
 
-/// Makes a key file, readable for its owner alone, and beside it `<file>.pub` where there is a public part. What exists is
-/// never replaced.
+/// Makes a key file, readable for its owner alone, and beside it `<file>.pub` where there is a
+/// public part. What exists is never replaced.
 ///
 /// # Errors
 /// [`CliError::Failed`].
@@ -185,19 +185,20 @@ pub(super) fn keygen(what: KeyUse, file: &Path) -> Result<Value, CliError> {
             None
         }
     };
-    Ok(json!({ "alg": what.as_str(), "file": file.display().to_string(), "public_file": public_file }))
+    Ok(json!({
+        "alg": what.as_str(),
+        "file": file.display().to_string(),
+        "public_file": public_file,
+    }))
 }
 
 fn write_new(path: &Path, content: &[u8], mode: u32) -> Result<(), CliError> {
-    let written = OpenOptions::new()
-        .create_new(true)
-        .write(true)
-        .mode(mode)
-        .open(path)
-        .and_then(|mut file| {
+    let written = OpenOptions::new().create_new(true).write(true).mode(mode).open(path).and_then(
+        |mut file| {
             file.write_all(content)?;
             file.sync_all()
-        });
+        },
+    );
     written.map_err(|error| match error.kind() {
         std::io::ErrorKind::AlreadyExists => {
             CliError::Failed(format!("{} exists; a key is never written over", path.display()))
@@ -241,7 +242,9 @@ mod tests {
             assert_eq!(inspected["claims"]["sub"], "ops");
             let text = description(&inspected, NOW_MS);
             assert!(
-                text.contains("subject    ops\nroles      operator\nlayer      -\nvalidity   runs out in "),
+                text.contains(
+                    "subject    ops\nroles      operator\nlayer      -\nvalidity   runs out in "
+                ),
                 "{text}"
             );
             assert!(text.contains(&format!("algorithm  {algorithm}\n")), "{text}");

@@ -1,4 +1,5 @@
-//! `blaze topology` and `blaze digest`: where everything runs, and what the worker of a layer should hold.
+//! `blaze topology` and `blaze digest`: where everything runs, and what the worker of a layer
+//! should hold.
 
 use blaze_domain::LayerName;
 use clap::Args;
@@ -71,7 +72,8 @@ fn table(answer: &Value, width: Option<u16>) -> String {
         // A layer without nodes has a line, too.
         nodes.extend(of_layer.is_empty().then_some((layer, None)));
     }
-    let at = |node: &Option<&Value>, pointer: &str| cell(node.and_then(|node| node.pointer(pointer)));
+    let at =
+        |node: &Option<&Value>, pointer: &str| cell(node.and_then(|node| node.pointer(pointer)));
     let mut text = output::table(
         &nodes,
         width,
@@ -114,12 +116,14 @@ fn worker(worker: Option<&Value>) -> &'static str {
     }
 }
 
-/// `slam/0, detector/0 (unhealthy)`: what runs on a node, with its state where that is known and not `ready`.
+/// `slam/0, detector/0 (unhealthy)`: what runs on a node, with its state where that is known and
+/// not `ready`.
 fn runs(node: &Value) -> String {
     let services: Vec<String> = list(node, "services")
         .iter()
         .map(|service| {
-            let name = format!("{}/{}", cell(service.get("service")), cell(service.get("instance")));
+            let name =
+                format!("{}/{}", cell(service.get("service")), cell(service.get("instance")));
             match member(service, "state").as_str() {
                 "" | "ready" => name,
                 state => format!("{name} ({state})"),
@@ -139,9 +143,13 @@ mod tests {
     fn a_topology_has_a_line_per_node() {
         let answer = json!({"revision": 6, "links": [], "layers": [
             {"name": "edge", "kind": "edge", "nodes": [
-                {"name": "robot-1", "type": "mobile", "worker": {"connected": true, "revision": 6, "in_sync": true, "last_seen": null},
-                 "services": [{"service": "slam", "instance": "0", "state": "ready"}, {"service": "log", "instance": "0", "state": "unhealthy"}]},
-                {"name": "robot-2", "type": "static", "worker": {"connected": null, "revision": null}, "services": []}]},
+                {"name": "robot-1", "type": "mobile",
+                    "worker": {"connected": true, "revision": 6, "in_sync": true,
+                    "last_seen": null},
+                 "services": [{"service": "slam", "instance": "0", "state": "ready"},
+                     {"service": "log", "instance": "0", "state": "unhealthy"}]},
+                {"name": "robot-2", "type": "static",
+                    "worker": {"connected": null, "revision": null}, "services": []}]},
             {"name": "fog", "kind": "fog", "nodes": []}]});
         assert_eq!(
             table(&answer, None),
@@ -150,18 +158,21 @@ mod tests {
              edge   edge  robot-2  static  -               -  -\n\
              fog    fog   -        -       -               -  -\n"
         );
-        let linked =
-            json!({"layers": [], "links": [{"from_node": "a", "to_node": "b", "latency_ms": 1.5, "loss": null}]});
-        assert!(table(&linked, None).ends_with("\nFROM  TO  LATENCY MS  LOSS\na     b          1.5     -\n"));
+        let linked = json!({
+            "layers": [],
+            "links": [{"from_node": "a", "to_node": "b", "latency_ms": 1.5, "loss": null}],
+        });
+        assert!(
+            table(&linked, None)
+                .ends_with("\nFROM  TO  LATENCY MS  LOSS\na     b          1.5     -\n")
+        );
     }
 
     #[test]
     fn what_is_missing_is_a_dash_and_never_a_failure() {
-        for answer in [
-            json!({}),
-            json!({"layers": [7, {"nodes": [{}, 3]}], "links": [{}]}),
-            json!([]),
-        ] {
+        for answer in
+            [json!({}), json!({"layers": [7, {"nodes": [{}, 3]}], "links": [{}]}), json!([])]
+        {
             let _ = table(&answer, Some(20));
         }
     }

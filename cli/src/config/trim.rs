@@ -42,7 +42,8 @@ pub(super) async fn run(options: &TrimOptions, format: Format) -> Result<Exit, C
 
 fn question(before: u64) -> String {
     format!(
-        "What happened before revision {before} would be removed from the history for good; watches that are behind it list anew.\nRemove it?"
+        "What happened before revision {before} would be removed from the history for good; \
+         watches that are behind it list anew.\nRemove it?"
     )
 }
 

@@ -68,11 +68,7 @@ pub(crate) enum Shown {
     /// Something in between is lost: what exists follows, then the changes after it.
     Relist(Lost),
     /// What exists of a kind.
-    Listed {
-        kind: Kind,
-        revision: u64,
-        items: Vec<Value>,
-    },
+    Listed { kind: Kind, revision: u64, items: Vec<Value> },
 }
 
 /// Watches until it is interrupted.
@@ -118,7 +114,8 @@ pub(crate) async fn until_interrupted(
         if text.is_empty() { Ok(()) } else { output::print(&text) }
     };
     tokio::select! {
-        ended = follow(client, scope, since, format == Format::Table, &mut show) => ended.map(|()| Exit::Done),
+        ended = follow(client, scope, since, format == Format::Table, &mut show) =>
+            ended.map(|()| Exit::Done),
         stopped = interrupted() => stopped.map(|()| Exit::Done),
     }
 }
@@ -126,11 +123,15 @@ pub(crate) async fn until_interrupted(
 /// Why everything is listed, for people.
 fn reason(lost: Lost) -> String {
     match lost {
-        Lost::Trimmed => "what happened in between is no longer kept; this is what there is".to_owned(),
+        Lost::Trimmed => {
+            "what happened in between is no longer kept; this is what there is".to_owned()
+        }
         Lost::Ahead(revision) => {
-            let at = revision.map_or_else(String::new, |revision| format!(": it is at revision {revision}"));
+            let at = revision
+                .map_or_else(String::new, |revision| format!(": it is at revision {revision}"));
             format!(
-                "the store is not as far as that{at} (another database, a restored backup, or a slip in --since); this is what there is"
+                "the store is not as far as that{at} (another database, a restored backup, or a \
+                 slip in --since); this is what there is"
             )
         }
     }
@@ -139,7 +140,9 @@ fn reason(lost: Lost) -> String {
 impl Scope {
     fn check(&self) -> Result<(), CliError> {
         match (self.kind, &self.key, &self.service) {
-            (_, Some(_), Some(_)) => Err(CliError::Usage("--service and a name: give one of them".to_owned())),
+            (_, Some(_), Some(_)) => {
+                Err(CliError::Usage("--service and a name: give one of them".to_owned()))
+            }
             (Some(kind), None, Some(_)) if kind != Kind::Instance => Err(CliError::Usage(
                 "--service is for instances: `blaze watch instances --service NAME`".to_owned(),
             )),
@@ -183,7 +186,9 @@ impl Scope {
             lists.push(match client.list(kind, &filter).await {
                 Ok(listing) => (kind, listing.revision.unwrap_or(before), listing.items),
                 // The service is gone, and its instances with it.
-                Err(CliError::Problem(refusal)) if refusal.code() == "not_found" => (kind, before, Vec::new()),
+                Err(CliError::Problem(refusal)) if refusal.code() == "not_found" => {
+                    (kind, before, Vec::new())
+                }
                 Err(error) => return Err(error),
             });
         }
@@ -200,11 +205,10 @@ async fn one(client: &Client, key: &Key) -> Result<(Kind, u64, Vec<Value>), CliE
     })
 }
 
-/// The revision of the store. It is asked for before a read that may find nothing, so that nothing falls in between.
+/// The revision of the store. It is asked for before a read that may find nothing, so that nothing
+/// falls in between.
 async fn revision(client: &Client) -> Result<u64, CliError> {
-    let answer = client
-        .send(&Call::get(format!("{BASE}/layers")).query("limit", "1"))
-        .await?;
+    let answer = client.send(&Call::get(format!("{BASE}/layers")).query("limit", "1")).await?;
     let told = answer.body.get("revision").and_then(Value::as_u64).or(answer.revision);
     told.ok_or_else(|| client.odd("a list has no revision"))
 }
@@ -264,7 +268,9 @@ fn text(shown: &Shown, format: Format) -> Result<String, CliError> {
     let value = match shown {
         Shown::Commit(value) | Shown::Bookmark(value) => value.clone(),
         Shown::Relist(_) => json!({ "relist": true }),
-        Shown::Listed { kind, revision, items } => json!({ "kind": kind, "revision": revision, "items": items }),
+        Shown::Listed { kind, revision, items } => {
+            json!({ "kind": kind, "revision": revision, "items": items })
+        }
     };
     match format {
         Format::Json => json_line(&value),
@@ -286,14 +292,14 @@ fn lines(shown: &Shown) -> String {
             };
             let revision = whole(commit, "revision");
             let changes = list(commit, "changes").iter();
-            changes
-                .map(|change| line(revision, &member(change, "op"), change, &by))
-                .collect()
+            changes.map(|change| line(revision, &member(change, "op"), change, &by)).collect()
         }
         Shown::Bookmark(bookmark) => format!("{:>8}  up to here\n", whole(bookmark, "revision")),
         // People are told on stderr.
         Shown::Relist(_) => String::new(),
-        Shown::Listed { revision, items, .. } => items.iter().map(|item| line(*revision, "exists", item, "")).collect(),
+        Shown::Listed { revision, items, .. } => {
+            items.iter().map(|item| line(*revision, "exists", item, "")).collect()
+        }
     }
 }
 

@@ -1,11 +1,13 @@
 //! Values as YAML that reads back as exactly the same values.
 //!
-//! What a general writer leaves bare may read back as something else under another version of YAML (`off`, `0o17`,
-//! `1_000`). Here only plain words stay bare; every other text is quoted as in JSON, or a block where it has lines.
+//! What a general writer leaves bare may read back as something else under another version of YAML
+//! (`off`, `0o17`, `1_000`). Here only plain words stay bare; every other text is quoted as in
+//! JSON, or a block where it has lines.
 
 use serde_json::Value;
 
-/// Words that mean something else than themselves somewhere in the history of YAML, in small letters.
+/// Words that mean something else than themselves somewhere in the history of YAML, in small
+/// letters.
 const RESERVED: [&str; 13] = [
     "null",
     "true",
@@ -136,16 +138,13 @@ fn inline(value: &Value) -> String {
 
 /// A text, bare if it cannot be taken for anything else.
 fn text(words: &str) -> String {
-    if is_plain(words) {
-        words.to_owned()
-    } else {
-        quoted(words)
-    }
+    if is_plain(words) { words.to_owned() } else { quoted(words) }
 }
 
 fn is_plain(words: &str) -> bool {
     let first = |c: char| c.is_ascii_alphabetic() || matches!(c, '_' | '/' | '$');
-    let rest = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '/' | '$' | '.' | '-' | '@');
+    let rest =
+        |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '/' | '$' | '.' | '-' | '@');
     words.len() <= 120
         && words.starts_with(first)
         && words.chars().all(rest)
@@ -163,7 +162,9 @@ fn quoted(words: &str) -> String {
             '\n' => out.push_str("\\n"),
             '\t' => out.push_str("\\t"),
             '\r' => out.push_str("\\r"),
-            c if c.is_control() || matches!(c, '\u{2028}' | '\u{2029}' | '\u{feff}' | '\u{fffe}' | '\u{ffff}') => {
+            c if c.is_control()
+                || matches!(c, '\u{2028}' | '\u{2029}' | '\u{feff}' | '\u{fffe}' | '\u{ffff}') =>
+            {
                 out.push_str(&format!("\\u{:04x}", u32::from(c)));
             }
             c => out.push(c),
@@ -173,7 +174,8 @@ fn quoted(words: &str) -> String {
     out
 }
 
-/// Whether a text is shown as a block of lines: several lines of printable ASCII, none of them special.
+/// Whether a text is shown as a block of lines: several lines of printable ASCII, none of them
+/// special.
 fn is_block(words: &str) -> bool {
     let body = words.strip_suffix('\n').unwrap_or(words);
     body.contains('\n')
@@ -218,8 +220,10 @@ mod tests {
             "kind": "Node", "name": "robot-1", "labels": {}, "annotations": {"note": "a: b"},
             "spec": {
                 "layer": "edge", "addresses": ["10.0.1.7"], "resources": {"cpus": 8},
-                "config": {"log": {"level": "info"}, "off": "off", "secret": {"$secret": {"redacted": true, "version": 3}},
-                    "list": [{"a": 1, "b": [2, {"c": null}]}, [], "x y"], "script": "one\n  two\n\nthree\n"},
+                "config": {"log": {"level": "info"}, "off": "off",
+                    "secret": {"$secret": {"redacted": true, "version": 3}},
+                    "list": [{"a": 1, "b": [2, {"c": null}]}, [], "x y"],
+                    "script": "one\n  two\n\nthree\n"},
             },
         });
         assert_eq!(
@@ -298,15 +302,9 @@ mod tests {
                 "{words:?}"
             );
         }
-        for words in [
-            "edge",
-            "robot-1",
-            "/camera/rate_hz",
-            "ops@example.org",
-            "v1.2",
-            "_x",
-            "$secret",
-        ] {
+        for words in
+            ["edge", "robot-1", "/camera/rate_hz", "ops@example.org", "v1.2", "_x", "$secret"]
+        {
             assert_eq!(inline(&json!(words)), words);
         }
     }
@@ -332,7 +330,8 @@ mod tests {
             "[ -~\n]{0,12}",
             "\\PC{0,6}",
             prop::sample::select(vec![
-                "off", "---", "a\nb", "a\nb\n", "a\n\nb", " a\nb", "a \nb", "|", "- a", "? b", "...\nx"
+                "off", "---", "a\nb", "a\nb\n", "a\n\nb", " a\nb", "a \nb", "|", "- a", "? b",
+                "...\nx"
             ])
             .prop_map(str::to_owned),
         ];

@@ -1,7 +1,7 @@
 //! What the service `analytics` does with the messages that come to it: how evenly they come.
 //!
-//! Of each `window` messages it makes one result: the mean and the largest gap between two of them. How many that are is its
-//! configuration; a change of it takes effect with the next message.
+//! Of each `window` messages it makes one result: the mean and the largest gap between two of them.
+//! How many that are is its configuration; a change of it takes effect with the next message.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -84,10 +84,8 @@ impl Analytics {
         state.sum += gap;
         state.largest = state.largest.max(gap);
         if state.gaps >= state.window {
-            state.newest = Some(Evenness {
-                mean_gap: state.sum / state.gaps,
-                largest_gap: state.largest,
-            });
+            state.newest =
+                Some(Evenness { mean_gap: state.sum / state.gaps, largest_gap: state.largest });
             state.results += 1;
             (state.gaps, state.sum, state.largest) = (0, Duration::ZERO, Duration::ZERO);
         }
@@ -120,10 +118,7 @@ impl Analytics {
         if let Some(window) = change.new.as_deref().and_then(window_of) {
             self.state.lock().window = window;
         }
-        self.called_back.send_replace(Some(CalledBack {
-            revision: change.revision,
-            at,
-        }));
+        self.called_back.send_replace(Some(CalledBack { revision: change.revision, at }));
     }
 }
 

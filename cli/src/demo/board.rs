@@ -1,4 +1,5 @@
-//! What the demo knows of each topic and consumer; written by the player and the consumers, read by the report.
+//! What the demo knows of each topic and consumer; written by the player and the consumers, read by
+//! the report.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -108,7 +109,8 @@ pub struct Move {
     pub from: String,
     /// `layer/node` where it is now.
     pub to: String,
-    /// From the last message there to the first here, by their publication; 0 when both ran side by side.
+    /// From the last message there to the first here, by their publication; 0 when both ran side by
+    /// side.
     pub gap_ms: f64,
 }
 
@@ -186,10 +188,9 @@ impl ConsumerEntry {
     fn dropped(&self) -> BTreeMap<String, u64> {
         let mut total = self.on_the_way.total();
         let counts = &self.at_consumer;
-        for (reason, count) in [
-            (DropReason::QueueFull, counts.queue_dropped),
-            (DropReason::Lifespan, counts.expired),
-        ] {
+        for (reason, count) in
+            [(DropReason::QueueFull, counts.queue_dropped), (DropReason::Lifespan, counts.expired)]
+        {
             if count > 0 {
                 *total.entry(reason.as_str().to_owned()).or_default() += count;
             }
@@ -232,10 +233,8 @@ impl Board {
     /// A consumer begins to listen. `None`: nobody plays its topic.
     pub fn add_consumer(&self, consumer: Consumer, now: Instant) -> Option<ConsumerId> {
         let mut state = self.state.lock();
-        let publisher = state
-            .publishers
-            .iter()
-            .position(|entry| entry.topic.name == consumer.topic)?;
+        let publisher =
+            state.publishers.iter().position(|entry| entry.topic.name == consumer.topic)?;
         state.consumers.push(ConsumerEntry {
             consumer,
             publisher,
@@ -250,8 +249,8 @@ impl Board {
         Some(ConsumerId(state.consumers.len() - 1))
     }
 
-    /// A frame came. `unix_ns` is the clock of this host; it is compared with the publisher's only if that runs here
-    /// too, else the age that the flows wrote into the frame counts.
+    /// A frame came. `unix_ns` is the clock of this host; it is compared with the publisher's only
+    /// if that runs here too, else the age that the flows wrote into the frame counts.
     pub fn frame_arrived(&self, id: ConsumerId, frame: &Frame, unix_ns: u64, now: Instant) {
         let latency = if self.same_clock {
             Duration::from_nanos(unix_ns.saturating_sub(frame.publish_time_ns()))
@@ -315,26 +314,28 @@ impl Board {
         received.iter().sum::<u64>() as f64 / received.len().max(1) as f64
     }
 
-    /// Takes over routes and drops from the flows. What is not to be seen any more keeps its last value.
+    /// Takes over routes and drops from the flows. What is not to be seen any more keeps its last
+    /// value.
     pub fn set_view(&self, view: &FlowView) {
         let from = Spot::Node(PUBLISHING_NODE);
         for entry in &mut self.state.lock().consumers {
-            if let Some(path) = view.path(entry.consumer.topic.as_str(), &from, &entry.consumer.spot()) {
+            if let Some(path) =
+                view.path(entry.consumer.topic.as_str(), &from, &entry.consumer.spot())
+            {
                 entry.route = path.route;
                 entry.on_the_way.set(path.dropped);
             }
         }
     }
 
-    /// What happened since the last call: a row for each consumer that listens, and for each topic without any.
+    /// What happened since the last call: a row for each consumer that listens, and for each topic
+    /// without any.
     #[must_use]
     pub fn recent(&self, now: Instant) -> Vec<TopicRow> {
         let mut state = self.state.lock();
         let seconds = now.saturating_duration_since(state.looked).as_secs_f64();
         state.looked = now;
-        let State {
-            publishers, consumers, ..
-        } = &mut *state;
+        let State { publishers, consumers, .. } = &mut *state;
         let mut rows = Vec::new();
         for entry in consumers.iter_mut() {
             let period = entry.stats.take_recent(now);
@@ -358,20 +359,20 @@ impl Board {
         rows
     }
 
-    /// Everything until `end`: a row for each consumer there ever was, and for each topic without any.
+    /// Everything until `end`: a row for each consumer there ever was, and for each topic without
+    /// any.
     #[must_use]
     pub fn total(&self, end: Instant) -> Vec<TopicRow> {
         let state = self.state.lock();
-        let State {
-            publishers, consumers, ..
-        } = &*state;
+        let State { publishers, consumers, .. } = &*state;
         let sent = |publisher: &PublisherEntry| {
             let since = |first| end.saturating_duration_since(first).as_secs_f64();
             (publisher.sent, publisher.first.map_or(0.0, since))
         };
         let heard = consumers.iter().filter_map(|entry| {
             let publisher = publishers.get(entry.publisher)?;
-            // One that has left is measured up to its last message, and so is one to which messages still came after the end.
+            // One that has left is measured up to its last message, and so is one to which messages
+            // still came after the end.
             let last = entry.stats.last.map_or(end, |(at, _)| at);
             let until = if entry.active { last.max(end) } else { last };
             let (count, seconds) = sent(publisher);
@@ -396,13 +397,16 @@ impl Board {
         first
     }
 
-    /// The move of the consumer, once messages have come to it at both ends and it has left the first.
+    /// The move of the consumer, once messages have come to it at both ends and it has left the
+    /// first.
     #[must_use]
     pub fn moved(&self) -> Option<Move> {
         let state = self.state.lock();
         let find = |node: DemoNode| {
             let mut entries = state.consumers.iter();
-            entries.find(|entry| entry.consumer.service == MOVING_SERVICE && entry.consumer.node == node)
+            entries.find(|entry| {
+                entry.consumer.service == MOVING_SERVICE && entry.consumer.node == node
+            })
         };
         let (left, joined) = (find(MOVES_FROM)?, find(MOVES_TO)?);
         let (_, last_ns) = left.stats.last.filter(|_| !left.active)?;
@@ -416,7 +420,8 @@ impl Board {
     }
 }
 
-/// Rows for what is published here and heard by nobody here; `sent` gives the messages and the seconds they took.
+/// Rows for what is published here and heard by nobody here; `sent` gives the messages and the
+/// seconds they took.
 fn unheard<'a>(
     publishers: &'a [PublisherEntry],
     consumers: &'a [ConsumerEntry],
@@ -425,21 +430,11 @@ fn unheard<'a>(
 ) -> impl Iterator<Item = TopicRow> + 'a {
     let nobody = move |publisher: &&PublisherEntry| {
         publisher.here
-            && !consumers
-                .iter()
-                .any(|entry| entry.consumer.topic == publisher.topic.name)
+            && !consumers.iter().any(|entry| entry.consumer.topic == publisher.topic.name)
     };
     publishers.iter().filter(nobody).map(move |publisher| {
         let (count, seconds) = sent(publisher);
-        row(
-            publisher,
-            count,
-            seconds,
-            None,
-            &Period::default(),
-            Faults::default(),
-            now,
-        )
+        row(publisher, count, seconds, None, &Period::default(), Faults::default(), now)
     })
 }
 
@@ -478,7 +473,10 @@ fn row(
     }
 }
 
-fn difference(now: &BTreeMap<String, u64>, before: &BTreeMap<String, u64>) -> BTreeMap<String, u64> {
+fn difference(
+    now: &BTreeMap<String, u64>,
+    before: &BTreeMap<String, u64>,
+) -> BTreeMap<String, u64> {
     let grown = now.iter().map(|(reason, count)| {
         let earlier = before.get(reason).copied().unwrap_or(0);
         (reason.clone(), count.saturating_sub(earlier))

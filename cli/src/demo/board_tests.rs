@@ -18,20 +18,11 @@ fn topic(name: &str, large: bool) -> PlayedTopic {
 }
 
 fn board(nodes: &[DemoNode], start: Instant) -> Board {
-    Board::new(
-        vec![topic("imu/data", false), topic("camera/image_raw", true)],
-        nodes,
-        start,
-    )
+    Board::new(vec![topic("imu/data", false), topic("camera/image_raw", true)], nodes, start)
 }
 
 fn consumer(service: &'static str, node: DemoNode) -> Consumer {
-    Consumer {
-        service,
-        node,
-        topic: "imu/data".parse().unwrap(),
-        later: false,
-    }
+    Consumer { service, node, topic: "imu/data".parse().unwrap(), later: false }
 }
 
 fn arrival(published_ms: u64) -> Arrival {
@@ -47,9 +38,7 @@ fn rows_show_the_last_second_and_the_whole() {
     let start = Instant::now();
     let at = |millis| start + Duration::from_millis(millis);
     let board = board(&DemoNode::ALL, start);
-    let recorder = board
-        .add_consumer(consumer("recorder", DemoNode::Cloud1), start)
-        .unwrap();
+    let recorder = board.add_consumer(consumer("recorder", DemoNode::Cloud1), start).unwrap();
     for index in 0..100 {
         board.published(0, at(index * 20));
         board.arrived(recorder, &arrival(index * 20), at(index * 20 + 1));
@@ -90,12 +79,9 @@ fn rows_show_the_last_second_and_the_whole() {
 fn the_gap_of_a_move_is_between_messages() {
     let start = Instant::now();
     let board = board(&DemoNode::ALL, start);
-    let fog = board
-        .add_consumer(consumer(roles::MOVING_SERVICE, DemoNode::Fog1), start)
-        .unwrap();
-    let cloud = board
-        .add_consumer(consumer(roles::MOVING_SERVICE, DemoNode::Cloud1), start)
-        .unwrap();
+    let fog = board.add_consumer(consumer(roles::MOVING_SERVICE, DemoNode::Fog1), start).unwrap();
+    let cloud =
+        board.add_consumer(consumer(roles::MOVING_SERVICE, DemoNode::Cloud1), start).unwrap();
     board.arrived(fog, &arrival(100), start);
     assert_eq!(board.moved(), None);
     board.arrived(cloud, &arrival(160), start);
@@ -110,10 +96,7 @@ fn the_gap_of_a_move_is_between_messages() {
     board.arrived(fog, &arrival(180), start);
     assert_eq!(board.moved().unwrap().gap_ms, 0.0);
     // One that has left has no live row any more, but stays in the summary.
-    assert_eq!(
-        board.recent(start).iter().filter(|row| row.service.is_some()).count(),
-        1
-    );
+    assert_eq!(board.recent(start).iter().filter(|row| row.service.is_some()).count(), 1);
     assert_eq!(board.total(start).iter().filter(|row| row.service.is_some()).count(), 2);
 }
 
@@ -127,9 +110,7 @@ fn the_age_counts_where_clocks_may_differ() {
     let frame = Frame::new(&header, Bytes::from_static(b"x")).unwrap();
     for (nodes, expected_ms) in [(&DemoNode::ALL[..], 500.0), (&[DemoNode::Cloud1][..], 7.0)] {
         let board = board(nodes, start);
-        let id = board
-            .add_consumer(consumer("recorder", DemoNode::Cloud1), start)
-            .unwrap();
+        let id = board.add_consumer(consumer("recorder", DemoNode::Cloud1), start).unwrap();
         board.frame_arrived(id, &frame, 1_500_000_000, start);
         let p50 = board.total(start)[0].latency_ms.p50.unwrap();
         assert!((p50 / expected_ms - 1.0).abs() < 0.125, "{p50}");

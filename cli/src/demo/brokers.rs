@@ -78,7 +78,8 @@ impl BrokerSource {
             Brokers::Memory => None,
             Brokers::Real if !cfg!(feature = "kafka") => {
                 return Err(CliError::Usage(
-                    "--brokers real: this build has no Kafka. Run `cargo run --release -p blaze -- demo --brokers real` (it needs a C++ compiler and make)."
+                    "--brokers real: this build has no Kafka. Run `cargo run --release -p blaze -- \
+                     demo --brokers real` (it needs a C++ compiler and make)."
                         .to_owned(),
                 ));
             }
@@ -95,59 +96,65 @@ impl BrokerSource {
     ///
     /// # Errors
     /// [`CliError::Failed`] when a client of a server cannot be made.
-    pub(super) fn of(&mut self, node: DemoNode, flow: &FlowId, epoch: u64) -> Result<NodeBrokers, CliError> {
-        let role = Role::Flow {
-            flow: flow.clone(),
-            epoch,
-        };
-        let fault = |error: blaze_brokers::OpenError| CliError::Failed(format!("{}: {error}", node.name()));
-        let (node_section, flow_node, services_node): (_, Arc<dyn Broker>, Arc<dyn Broker>) = match &self.servers {
-            None => {
-                let hub = MemoryHub::new(node.name());
-                (NodeBroker::Memory, Arc::new(hub.broker()), Arc::new(hub.broker()))
-            }
-            Some(servers) => {
-                let section = NodeBroker::Redis(RedisBroker {
-                    url: servers.redis.clone().into(),
-                    prefix: format!("{}:{}:", self.run, node.name()),
-                    user: None,
-                    password_file: None,
-                    tls: None,
-                });
-                let (flow, services) = (open_node(&section, &role), open_node(&section, &Role::Service));
-                (section, flow.map_err(fault)?, services.map_err(fault)?)
-            }
-        };
+    pub(super) fn of(
+        &mut self,
+        node: DemoNode,
+        flow: &FlowId,
+        epoch: u64,
+    ) -> Result<NodeBrokers, CliError> {
+        let role = Role::Flow { flow: flow.clone(), epoch };
+        let fault =
+            |error: blaze_brokers::OpenError| CliError::Failed(format!("{}: {error}", node.name()));
+        let (node_section, flow_node, services_node): (_, Arc<dyn Broker>, Arc<dyn Broker>) =
+            match &self.servers {
+                None => {
+                    let hub = MemoryHub::new(node.name());
+                    (NodeBroker::Memory, Arc::new(hub.broker()), Arc::new(hub.broker()))
+                }
+                Some(servers) => {
+                    let section = NodeBroker::Redis(RedisBroker {
+                        url: servers.redis.clone().into(),
+                        prefix: format!("{}:{}:", self.run, node.name()),
+                        user: None,
+                        password_file: None,
+                        tls: None,
+                    });
+                    let (flow, services) =
+                        (open_node(&section, &role), open_node(&section, &Role::Service));
+                    (section, flow.map_err(fault)?, services.map_err(fault)?)
+                }
+            };
         let kafka = self.servers.as_ref().and_then(|servers| match node {
             DemoNode::Fog1 => Some(servers.kafka_fog.clone()),
             DemoNode::Cloud1 => Some(servers.kafka_cloud.clone()),
             DemoNode::Robot1 | DemoNode::Edge2 => None,
         });
-        let (flow_layer, services_layer, layer_prefix): (LayerBroker, Arc<dyn Broker>, String) = match kafka {
-            None => {
-                let (hub, id) = self
-                    .layers
-                    .entry(node.layer())
-                    .or_insert_with(|| (MemoryHub::new(node.layer()), LayerScopeId::private()));
-                let broker = Arc::new(hub.broker());
-                (LayerBroker { broker, id: *id }, Arc::new(hub.broker()), String::new())
-            }
-            Some(bootstrap) => {
-                let prefix = format!("{}-{}.", self.run, node.layer());
-                let id = LayerScopeId::kafka(&prefix);
-                let section = LayerSection::Kafka(KafkaBroker {
-                    bootstrap: vec![bootstrap],
-                    prefix: prefix.clone(),
-                    properties: BTreeMap::new(),
-                });
-                let broker = open_layer(&section, &role).map_err(fault)?;
-                (
-                    LayerBroker { broker, id },
-                    open_layer(&section, &Role::Service).map_err(fault)?,
-                    prefix,
-                )
-            }
-        };
+        let (flow_layer, services_layer, layer_prefix): (LayerBroker, Arc<dyn Broker>, String) =
+            match kafka {
+                None => {
+                    let (hub, id) = self
+                        .layers
+                        .entry(node.layer())
+                        .or_insert_with(|| (MemoryHub::new(node.layer()), LayerScopeId::private()));
+                    let broker = Arc::new(hub.broker());
+                    (LayerBroker { broker, id: *id }, Arc::new(hub.broker()), String::new())
+                }
+                Some(bootstrap) => {
+                    let prefix = format!("{}-{}.", self.run, node.layer());
+                    let id = LayerScopeId::kafka(&prefix);
+                    let section = LayerSection::Kafka(KafkaBroker {
+                        bootstrap: vec![bootstrap],
+                        prefix: prefix.clone(),
+                        properties: BTreeMap::new(),
+                    });
+                    let broker = open_layer(&section, &role).map_err(fault)?;
+                    (
+                        LayerBroker { broker, id },
+                        open_layer(&section, &Role::Service).map_err(fault)?,
+                        prefix,
+                    )
+                }
+            };
         Ok(NodeBrokers {
             flow_node,
             flow_layer,
@@ -164,8 +171,10 @@ impl Servers {
         let from = std::env::current_dir().unwrap_or_default();
         let Some((path, text)) = environment_file(&from) else {
             return Err(CliError::Usage(format!(
-                "--brokers real: there is no {ENVIRONMENT_FILE} here. Run `./scripts/services install && ./scripts/services start` in the repository, \
-                 or write that file with BLAZE_TEST_REDIS_URL, BLAZE_TEST_KAFKA_FOG and BLAZE_TEST_KAFKA_CLOUD."
+                "--brokers real: there is no {ENVIRONMENT_FILE} here. Run `./scripts/services \
+                 install && ./scripts/services start` in the repository, \
+                 or write that file with BLAZE_TEST_REDIS_URL, BLAZE_TEST_KAFKA_FOG and \
+                 BLAZE_TEST_KAFKA_CLOUD."
             )));
         };
         Self::read(&text).map_err(|missing| {
@@ -180,10 +189,7 @@ impl Servers {
         let lines: HashMap<&str, &str> = text
             .lines()
             .filter_map(|line| {
-                line.trim()
-                    .strip_prefix("export ")
-                    .unwrap_or(line.trim())
-                    .split_once('=')
+                line.trim().strip_prefix("export ").unwrap_or(line.trim()).split_once('=')
             })
             .map(|(key, value)| (key.trim(), value.trim().trim_matches(['"', '\''])))
             .collect();
@@ -213,11 +219,7 @@ mod tests {
         let text = "# servers\nBLAZE_TEST_REDIS_URL=redis://127.0.0.1:1\nexport BLAZE_TEST_KAFKA_FOG=\"127.0.0.1:2\"\nBLAZE_TEST_KAFKA_CLOUD = 127.0.0.1:3\n";
         let servers = Servers::read(text).unwrap();
         assert_eq!(
-            (
-                servers.redis.as_str(),
-                servers.kafka_fog.as_str(),
-                servers.kafka_cloud.as_str()
-            ),
+            (servers.redis.as_str(), servers.kafka_fog.as_str(), servers.kafka_cloud.as_str()),
             ("redis://127.0.0.1:1", "127.0.0.1:2", "127.0.0.1:3")
         );
         assert_eq!(Servers::read("BLAZE_TEST_REDIS_URL=x"), Err("BLAZE_TEST_KAFKA_FOG"));

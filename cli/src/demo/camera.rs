@@ -1,7 +1,8 @@
-//! Recorded camera pictures: `sensor_msgs/msg/CompressedImage` with JPEG becomes RGB, three bytes a pixel.
+//! Recorded camera pictures: `sensor_msgs/msg/CompressedImage` with JPEG becomes RGB, three bytes a
+//! pixel.
 //!
-//! Pictures are decoded when a recording is loaded, by two threads. What would need more than [`MAX_DECODED_BYTES`]
-//! stays JPEG and is decoded just before it is due.
+//! Pictures are decoded when a recording is loaded, by two threads. What would need more than
+//! [`MAX_DECODED_BYTES`] stays JPEG and is decoded just before it is due.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -54,7 +55,8 @@ impl Budget {
     }
 }
 
-/// Reads a CDR text or byte field after another; positions count from behind the encapsulation header.
+/// Reads a CDR text or byte field after another; positions count from behind the encapsulation
+/// header.
 struct Cdr<'a> {
     data: &'a [u8],
     at: usize,
@@ -70,22 +72,14 @@ impl<'a> Cdr<'a> {
             [0, 1] => false,
             _ => return None,
         };
-        Some(Self {
-            data,
-            at: 0,
-            big_endian,
-        })
+        Some(Self { data, at: 0, big_endian })
     }
 
     fn u32(&mut self) -> Option<u32> {
         self.at = self.at.next_multiple_of(4);
         let bytes: [u8; 4] = self.data.get(self.at..self.at + 4)?.try_into().ok()?;
         self.at += 4;
-        Some(if self.big_endian {
-            u32::from_be_bytes(bytes)
-        } else {
-            u32::from_le_bytes(bytes)
-        })
+        Some(if self.big_endian { u32::from_be_bytes(bytes) } else { u32::from_le_bytes(bytes) })
     }
 
     /// A length and as many bytes; returns where they are.
@@ -98,7 +92,8 @@ impl<'a> Cdr<'a> {
     }
 }
 
-/// The picture inside a `CompressedImage`, without a copy, and its format, for example `rgb8; jpeg compressed bgr8`.
+/// The picture inside a `CompressedImage`, without a copy, and its format, for example `rgb8; jpeg
+/// compressed bgr8`.
 ///
 /// # Errors
 /// [`CameraError::Cdr`] with the field that is broken.
@@ -109,9 +104,7 @@ pub fn parse_compressed_image(message: &Bytes) -> Result<(String, Bytes), Camera
     cdr.u32().ok_or(broken("header.stamp"))?;
     cdr.bytes().ok_or(broken("header.frame_id"))?;
     let format = cdr.bytes().ok_or(broken("format"))?;
-    let format = String::from_utf8_lossy(&cdr.data[format])
-        .trim_end_matches('\0')
-        .to_owned();
+    let format = String::from_utf8_lossy(&cdr.data[format]).trim_end_matches('\0').to_owned();
     let data = cdr.bytes().ok_or(broken("data"))?;
     Ok((format, message.slice(data.start + 4..data.end + 4)))
 }
@@ -130,9 +123,7 @@ fn decoder(jpeg: &[u8]) -> JpegDecoder<ZCursor<&[u8]>> {
 /// [`CameraError::Jpeg`] or [`CameraError::TooLarge`].
 pub fn decoded_bytes(jpeg: &[u8]) -> Result<usize, CameraError> {
     let mut decoder = decoder(jpeg);
-    decoder
-        .decode_headers()
-        .map_err(|error| CameraError::Jpeg(error.to_string()))?;
+    decoder.decode_headers().map_err(|error| CameraError::Jpeg(error.to_string()))?;
     let info = decoder.info().ok_or_else(|| CameraError::Jpeg("no size".to_owned()))?;
     let bytes = usize::from(info.width) * usize::from(info.height) * 3;
     if bytes > MAX_PAYLOAD_BYTES {
@@ -147,32 +138,29 @@ pub fn decoded_bytes(jpeg: &[u8]) -> Result<usize, CameraError> {
 /// [`CameraError::Jpeg`] or [`CameraError::TooLarge`].
 pub fn decode(jpeg: &[u8]) -> Result<Bytes, CameraError> {
     let expected = decoded_bytes(jpeg)?;
-    let pixels = decoder(jpeg)
-        .decode()
-        .map_err(|error| CameraError::Jpeg(error.to_string()))?;
+    let pixels = decoder(jpeg).decode().map_err(|error| CameraError::Jpeg(error.to_string()))?;
     if pixels.len() != expected {
-        return Err(CameraError::Jpeg(format!(
-            "{} bytes instead of {expected}",
-            pixels.len()
-        )));
+        return Err(CameraError::Jpeg(format!("{} bytes instead of {expected}", pixels.len())));
     }
     Ok(Bytes::from(pixels))
 }
 
-/// Turns the topics that hold JPEG pictures into topics of RGB. Returns how many messages do not decode; they go.
-pub(super) fn decode_topics(raw: &mut RawRecording, taken: &[TopicName], budget: &mut Budget) -> u64 {
+/// Turns the topics that hold JPEG pictures into topics of RGB. Returns how many messages do not
+/// decode; they go.
+pub(super) fn decode_topics(
+    raw: &mut RawRecording,
+    taken: &[TopicName],
+    budget: &mut Budget,
+) -> u64 {
     let mut unusable = 0;
     for topic in 0..raw.topics.len() {
         let Some((name, picture_bytes)) = decodable(raw, topic, taken) else {
             continue;
         };
-        let places: Vec<usize> = (0..raw.messages.len())
-            .filter(|place| raw.messages[*place].0 == topic)
-            .collect();
-        let mut pictures: Vec<(usize, Result<Body, CameraError>)> = places
-            .into_iter()
-            .map(|place| (place, jpeg_of(&raw.messages[place].2)))
-            .collect();
+        let places: Vec<usize> =
+            (0..raw.messages.len()).filter(|place| raw.messages[*place].0 == topic).collect();
+        let mut pictures: Vec<(usize, Result<Body, CameraError>)> =
+            places.into_iter().map(|place| (place, jpeg_of(&raw.messages[place].2))).collect();
         let needed = picture_bytes.saturating_mul(pictures.len());
         if needed <= budget.0 {
             budget.0 -= needed;

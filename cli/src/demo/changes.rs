@@ -128,7 +128,9 @@ impl<S: Stage> Changing<'_, S> {
             self.until(LINK_AT).await;
             self.change_link().await;
         } else {
-            self.tell("no pictures are played, so the limit of the link is left as it is".to_owned());
+            self.tell(
+                "no pictures are played, so the limit of the link is left as it is".to_owned(),
+            );
         }
     }
 
@@ -216,10 +218,7 @@ impl<S: Stage> Changing<'_, S> {
                     Wanted::Window(_) => format!("the configuration of {MOVING_SERVICE}"),
                     Wanted::Limit(_) => format!("the limit of {}", PUBLISHING_NODE.flow()),
                 };
-                self.outcome
-                    .lock()
-                    .problems
-                    .push(format!("{what} was not changed: {fault}"));
+                self.outcome.lock().problems.push(format!("{what} was not changed: {fault}"));
                 None
             }
         }
@@ -245,17 +244,20 @@ impl Change {
     pub(super) fn asked(&self) -> String {
         format!(
             "PUT {} ({} {} → {}): 2xx after {:.1} ms, the callback of {} on {} after {:.1} ms",
-            self.document, self.setting, self.from, self.to, self.accepted_ms, self.service, self.at, self.callback_ms
+            self.document,
+            self.setting,
+            self.from,
+            self.to,
+            self.accepted_ms,
+            self.service,
+            self.at,
+            self.callback_ms
         )
     }
 
     /// What it did.
     pub(super) fn effect_text(&self) -> String {
-        let each = if self.effect == PICTURES {
-            " to each consumer in fog and cloud"
-        } else {
-            ""
-        };
+        let each = if self.effect == PICTURES { " to each consumer in fog and cloud" } else { "" };
         format!(
             "{}: {:.1} → {:.1} {} a second{each}",
             self.service, self.before_per_s, self.after_per_s, self.effect

@@ -8,7 +8,8 @@
 //! cloud-1: node broker ─ flow ─ cloud layer broker ───────┘
 //! ```
 //!
-//! Where all of them run here, a main service of BlazeConfig and a worker on each node broker run beside them.
+//! Where all of them run here, a main service of BlazeConfig and a worker on each node broker run
+//! beside them.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -35,7 +36,8 @@ use crate::output::Format;
 /// Runs the demo.
 ///
 /// # Errors
-/// [`CliError::Usage`] for options that make no sense, [`CliError::Failed`] for what could not be started.
+/// [`CliError::Usage`] for options that make no sense, [`CliError::Failed`] for what could not be
+/// started.
 pub async fn run(options: DemoOptions, format: Format) -> Result<Exit, CliError> {
     let start = Instant::now();
     options.check()?;
@@ -45,7 +47,8 @@ pub async fn run(options: DemoOptions, format: Format) -> Result<Exit, CliError>
     let ends = Ends::new(supervisor.clone())?;
     let outcome = tokio::select! {
         outcome = prepare(&options, supervisor.clone(), start) => outcome,
-        reason = ends.wait() => Err(CliError::Failed(reason.unwrap_or_else(|| "stopped before it began".to_owned()))),
+        reason = ends.wait() => Err(CliError::Failed(reason.unwrap_or_else(|| "stopped before it \
+            began".to_owned()))),
     };
     let (system, script) = match outcome {
         Ok(prepared) => prepared,
@@ -64,7 +67,11 @@ pub async fn run(options: DemoOptions, format: Format) -> Result<Exit, CliError>
 }
 
 /// Starts nodes and publishers while the recordings are read.
-async fn prepare(options: &DemoOptions, supervisor: Supervisor, start: Instant) -> Result<(System, Script), CliError> {
+async fn prepare(
+    options: &DemoOptions,
+    supervisor: Supervisor,
+    start: Instant,
+) -> Result<(System, Script), CliError> {
     let files = options.record.clone();
     let reading = tokio::task::spawn_blocking(move || match files.as_slice() {
         [] => recording::load_built_in(),
@@ -116,9 +123,14 @@ async fn prepare(options: &DemoOptions, supervisor: Supervisor, start: Instant) 
 }
 
 /// The changes of the configuration that the run shows, or why it shows none.
-fn plan(options: &DemoOptions, nodes: &Nodes, topics: &[PlayedTopic]) -> Result<ChangePlan, String> {
+fn plan(
+    options: &DemoOptions,
+    nodes: &Nodes,
+    topics: &[PlayedTopic],
+) -> Result<ChangePlan, String> {
     let Some(robot) = nodes.robot().filter(|_| options.is_complete()) else {
-        return Err("no change of the configuration is shown: that needs all nodes in one process".to_owned());
+        return Err("no change of the configuration is shown: that needs all nodes in one process"
+            .to_owned());
     };
     if options.duration < SHORTEST {
         let shortest = SHORTEST.as_secs();
@@ -133,7 +145,10 @@ fn plan(options: &DemoOptions, nodes: &Nodes, topics: &[PlayedTopic]) -> Result<
     })
 }
 
-async fn start_configuration(nodes: &Nodes, supervisor: &Supervisor) -> Result<Configuration, CliError> {
+async fn start_configuration(
+    nodes: &Nodes,
+    supervisor: &Supervisor,
+) -> Result<Configuration, CliError> {
     let robot = nodes
         .robot()
         .ok_or_else(|| CliError::Failed(format!("{} does not run here", PUBLISHING_NODE.name())))?;
@@ -153,10 +168,7 @@ fn tell_skipped(recordings: &[Recording]) {
             eprintln!("blaze: {file}: {} is not played: {}", skipped.topic, skipped.reason);
         }
         if recording.unusable_messages > 0 {
-            eprintln!(
-                "blaze: {file}: {} messages cannot be played",
-                recording.unusable_messages
-            );
+            eprintln!("blaze: {file}: {} messages cannot be played", recording.unusable_messages);
         }
     }
 }

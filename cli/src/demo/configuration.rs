@@ -1,5 +1,5 @@
-//! BlazeConfig in the demo: a main service in memory, a worker on the broker of each node, and the two that follow it: the
-//! service `analytics`, and the flow of robot-1.
+//! BlazeConfig in the demo: a main service in memory, a worker on the broker of each node, and the
+//! two that follow it: the service `analytics`, and the flow of robot-1.
 //!
 //! ```text
 //! PUT ─► REST ─► main service ─► worker of fog-1   ─► node broker ─► analytics: callback
@@ -72,7 +72,9 @@ impl Configuration {
             let read = blaze_domain::node_file::NodeFile::read(&tree);
             let (mut file, _) = read.map_err(|faults| CliError::Failed(lines(&faults)))?;
             file.brokers.node = Some(place.broker_section);
-            workers.push(Worker::start(&file, Arc::clone(&place.broker), None, false, &supervisor).await?);
+            workers.push(
+                Worker::start(&file, Arc::clone(&place.broker), None, false, &supervisor).await?,
+            );
             if place.node == PUBLISHING_NODE {
                 let (tell, taken) = watch::channel(None);
                 let judged = move |verdict: &Verdict| {
@@ -83,23 +85,18 @@ impl Configuration {
                         }));
                     }
                 };
-                let service = follow(flow, &tree, file.cache_redis(), None, &supervisor, judged).await?;
+                let service =
+                    follow(flow, &tree, file.cache_redis(), None, &supervisor, judged).await?;
                 following = Some((service, taken));
             }
         }
-        let (flow, limit_taken) =
-            following.ok_or_else(|| CliError::Failed(format!("{} does not run here", PUBLISHING_NODE.name())))?;
+        let (flow, limit_taken) = following.ok_or_else(|| {
+            CliError::Failed(format!("{} does not run here", PUBLISHING_NODE.name()))
+        })?;
         for worker in &workers {
             worker.has(revision, READY).await?;
         }
-        Ok(Self {
-            main,
-            rest: addresses.rest,
-            workers,
-            flow,
-            limit_taken,
-            supervisor,
-        })
+        Ok(Self { main, rest: addresses.rest, workers, flow, limit_taken, supervisor })
     }
 
     /// REST of the main service.
@@ -108,19 +105,23 @@ impl Configuration {
     }
 
     /// Makes a change over REST, and waits until whom it concerns has been called back.
-    pub(super) async fn change(&self, wanted: &Wanted, analytics: Option<&Analytics>) -> Result<Taken, String> {
+    pub(super) async fn change(
+        &self,
+        wanted: &Wanted,
+        analytics: Option<&Analytics>,
+    ) -> Result<Taken, String> {
         let (document, mut called_back) = match wanted {
             Wanted::Window(window) => {
-                let analytics = analytics.ok_or_else(|| format!("{MOVING_SERVICE} does not run"))?;
+                let analytics =
+                    analytics.ok_or_else(|| format!("{MOVING_SERVICE} does not run"))?;
                 (service(*window), analytics.called_back())
             }
             Wanted::Limit(limit_mbps) => (robot(*limit_mbps), self.limit_taken.clone()),
         };
         let client = seed::client(self.rest).map_err(|error| error.to_string())?;
         let sent = Instant::now();
-        let revision = seed::replace(&client, &document)
-            .await
-            .map_err(|error| error.to_string())?;
+        let revision =
+            seed::replace(&client, &document).await.map_err(|error| error.to_string())?;
         let accepted = sent.elapsed();
         let is_it = |last: &Option<CalledBack>| last.is_some_and(|last| last.revision >= revision);
         let waited = tokio::time::timeout(CALLBACK, called_back.wait_for(is_it)).await;
@@ -129,11 +130,7 @@ impl Configuration {
             let limit = CALLBACK.as_secs();
             format!("revision {revision} did not come to whom it concerns within {limit} s")
         })?;
-        Ok(Taken {
-            revision,
-            accepted,
-            called_back: back.at.saturating_duration_since(sent),
-        })
+        Ok(Taken { revision, accepted, called_back: back.at.saturating_duration_since(sent) })
     }
 
     /// Ends everything but the brokers. Services that follow it have ended before.
@@ -159,10 +156,12 @@ fn section() -> ControlPlaneSection {
 
 /// What the demo begins with.
 fn documents() -> Vec<Value> {
-    let layers =
-        ["edge", "fog", "cloud"].map(|layer| json!({ "kind": "Layer", "name": layer, "spec": { "kind": layer } }));
+    let layers = ["edge", "fog", "cloud"]
+        .map(|layer| json!({ "kind": "Layer", "name": layer, "spec": { "kind": layer } }));
     let others = DemoNode::ALL.into_iter().filter(|node| *node != PUBLISHING_NODE);
-    let nodes = others.map(|node| json!({ "kind": "Node", "name": node.name(), "spec": { "layer": node.layer() } }));
+    let nodes = others.map(
+        |node| json!({ "kind": "Node", "name": node.name(), "spec": { "layer": node.layer() } }),
+    );
     let mut all = layers.to_vec();
     all.extend(nodes);
     all.extend([robot(None), service(DEFAULT_WINDOW)]);
@@ -177,7 +176,8 @@ fn service(window: u32) -> Value {
 fn robot(limit_mbps: Option<f64>) -> Value {
     let mut spec = json!({ "layer": PUBLISHING_NODE.layer(), "type": "mobile" });
     if let Some(limit_mbps) = limit_mbps {
-        spec["overrides"] = json!({ NAME: { "flow": { "bandwidth": { "limit_mbps": limit_mbps } } } });
+        spec["overrides"] =
+            json!({ NAME: { "flow": { "bandwidth": { "limit_mbps": limit_mbps } } } });
     }
     json!({ "kind": "Node", "name": PUBLISHING_NODE.name(), "spec": spec })
 }

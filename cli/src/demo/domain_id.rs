@@ -21,20 +21,21 @@ fn base_port(domain: u16) -> u16 {
     7_400 + 250 * domain
 }
 
-/// The last port of a domain's range; participants use it only where there are 120 of them on a host.
+/// The last port of a domain's range; participants use it only where there are 120 of them on a
+/// host.
 fn claim_port(domain: u16) -> u16 {
     base_port(domain) + 249
 }
 
-/// Finds a domain that nobody on this host uses at `address`, beginning with [`DEFAULT_DOMAIN`]. `None`: all are taken.
+/// Finds a domain that nobody on this host uses at `address`, beginning with [`DEFAULT_DOMAIN`].
+/// `None`: all are taken.
 #[must_use]
 pub fn reserve(address: Ipv4Addr) -> Option<ReservedDomain> {
     (DEFAULT_DOMAIN..=MAX_DDS_DOMAIN).find_map(|domain| {
         let claim = bind(Ipv4Addr::LOCALHOST, claim_port(domain))?;
         // SPDP and user traffic of the first participant, whoever started it.
-        let free = [10, 11]
-            .into_iter()
-            .all(|offset| bind(address, base_port(domain) + offset).is_some());
+        let free =
+            [10, 11].into_iter().all(|offset| bind(address, base_port(domain) + offset).is_some());
         free.then_some(ReservedDomain { domain, _claim: claim })
     })
 }

@@ -1,4 +1,5 @@
-//! What the flows of the demo say of themselves: by which bridges a topic travels, and what they dropped.
+//! What the flows of the demo say of themselves: by which bridges a topic travels, and what they
+//! dropped.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
@@ -47,12 +48,12 @@ impl FlowView {
         let mut view = Self::default();
         for (node, address) in admins {
             let address = FlowAddress::from(*address);
-            let Ok(Ok(value)) = timeout(ANSWER_TIMEOUT, get_json(&address, "/v1/bridges")).await else {
+            let Ok(Ok(value)) = timeout(ANSWER_TIMEOUT, get_json(&address, "/v1/bridges")).await
+            else {
                 continue;
             };
             if let Ok(answer) = typed::<Bridges>(&address, &value) {
-                view.bridges
-                    .extend(answer.bridges.into_iter().map(|bridge| (*node, bridge)));
+                view.bridges.extend(answer.bridges.into_iter().map(|bridge| (*node, bridge)));
             }
         }
         view
@@ -61,7 +62,8 @@ impl FlowView {
     /// Bridges of a topic that carry, for people: `robot-1 node→inter/cloud`.
     #[must_use]
     pub fn bridges_of(&self, topic: &str) -> BTreeSet<String> {
-        let carries = |(_, bridge): &&(DemoNode, Bridge)| bridge.topic == topic && bridge.state == "up";
+        let carries =
+            |(_, bridge): &&(DemoNode, Bridge)| bridge.topic == topic && bridge.state == "up";
         let describe = |(node, bridge): &(DemoNode, Bridge)| {
             let to = match (bridge.to.scope.as_str(), &bridge.to.layer) {
                 ("inter", Some(layer)) => format!("inter/{layer}"),
@@ -178,23 +180,18 @@ mod tests {
             (Robot1, "node:memory", "inter:dds", "fog", json!({"rate_limit": 3})),
             (Robot1, "node:memory", "inter:dds", "cloud", json!({"rate_limit": 7})),
             (Edge2, "layer:memory", "node:memory", "edge", json!({"echo": 1})),
-            (
-                Cloud1,
-                "inter:dds",
-                "layer:memory",
-                "cloud",
-                json!({"rate_limit": 1, "lifespan": 2}),
-            ),
+            (Cloud1, "inter:dds", "layer:memory", "cloud", json!({"rate_limit": 1, "lifespan": 2})),
         ];
-        view(&bridges.map(|(node, from, to, layer, dropped)| (node, bridge(from, to, layer, &dropped))))
+        view(
+            &bridges
+                .map(|(node, from, to, layer, dropped)| (node, bridge(from, to, layer, &dropped))),
+        )
     }
 
     #[test]
     fn paths_are_followed_over_flows() {
         let robot = Spot::Node(DemoNode::Robot1);
-        let cloud = demo()
-            .path("imu/data", &robot, &Spot::Layer("cloud".to_owned()))
-            .unwrap();
+        let cloud = demo().path("imu/data", &robot, &Spot::Layer("cloud".to_owned())).unwrap();
         assert_eq!(cloud.route, ["node:memory", "inter:dds", "layer:memory"]);
         assert_eq!(
             cloud.dropped,
@@ -223,16 +220,10 @@ mod tests {
 
     #[test]
     fn the_part_of_this_process_is_shown_alone() {
-        let here = view(&[(
-            DemoNode::Cloud1,
-            bridge("inter:dds", "layer:memory", "cloud", &json!({})),
-        )]);
+        let here =
+            view(&[(DemoNode::Cloud1, bridge("inter:dds", "layer:memory", "cloud", &json!({})))]);
         let path = here
-            .path(
-                "imu/data",
-                &Spot::Node(DemoNode::Robot1),
-                &Spot::Layer("cloud".to_owned()),
-            )
+            .path("imu/data", &Spot::Node(DemoNode::Robot1), &Spot::Layer("cloud".to_owned()))
             .unwrap();
         assert_eq!(path.route, ["inter:dds", "layer:memory"]);
     }

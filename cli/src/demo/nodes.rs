@@ -43,8 +43,12 @@ pub(super) struct Nodes {
 /// Starts the nodes that the options name.
 ///
 /// # Errors
-/// [`CliError::Usage`] for options that make no sense, [`CliError::Failed`] for what could not be started.
-pub(super) async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<Nodes, CliError> {
+/// [`CliError::Usage`] for options that make no sense, [`CliError::Failed`] for what could not be
+/// started.
+pub(super) async fn start_nodes(
+    options: &DemoOptions,
+    supervisor: &Supervisor,
+) -> Result<Nodes, CliError> {
     let listen = match options.listen {
         Some(IpAddr::V4(address)) => address,
         Some(IpAddr::V6(_)) | None => Ipv4Addr::LOCALHOST,
@@ -54,11 +58,7 @@ pub(super) async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) 
             "--listen {listen}: no interface of this host has this address."
         )));
     }
-    let reserved = if options.is_complete() {
-        domain_id::reserve(listen)
-    } else {
-        None
-    };
+    let reserved = if options.is_complete() { domain_id::reserve(listen) } else { None };
     let domain = match &reserved {
         Some(reserved) => reserved.domain,
         None if options.is_complete() => {
@@ -81,10 +81,7 @@ pub(super) async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) 
         let epochs = Epochs::begin(&settings.me, None)
             .map_err(|error| CliError::Failed(format!("{} has no epoch: {error}", node.name())))?;
         let brokers = source.of(node, &settings.me, epochs.first())?;
-        let beginning = Beginning {
-            epochs,
-            layer_prefix: brokers.layer_prefix.clone(),
-        };
+        let beginning = Beginning { epochs, layer_prefix: brokers.layer_prefix.clone() };
         let flow_options = FlowOptions {
             settings,
             node: Some(Arc::clone(&brokers.flow_node)),
@@ -92,9 +89,10 @@ pub(super) async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) 
             state_dir: None,
         };
         let of_node = supervisor.child(node.name());
-        let flow = blaze_flow::flow::start_with(flow_options, beginning, of_node.clone())
-            .await
-            .map_err(|error| CliError::Failed(format!("{} does not start: {error:#}", node.name())))?;
+        let flow =
+            blaze_flow::flow::start_with(flow_options, beginning, of_node.clone()).await.map_err(
+                |error| CliError::Failed(format!("{} does not start: {error:#}", node.name())),
+            )?;
         running.push(RunningNode {
             node,
             file,
@@ -104,10 +102,7 @@ pub(super) async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) 
             supervisor: of_node,
         });
     }
-    Ok(Nodes {
-        running,
-        _domain: reserved,
-    })
+    Ok(Nodes { running, _domain: reserved })
 }
 
 /// What a node of the demo has in its node file, with the user's `--set` on top.
@@ -134,19 +129,15 @@ fn settings_of(
         overrides: own
             .into_iter()
             .map(|(key, value)| (key.to_owned(), value))
-            .chain(
-                options
-                    .set
-                    .iter()
-                    .map(|setting| (setting.key.clone(), setting.value.clone())),
-            )
+            .chain(options.set.iter().map(|setting| (setting.key.clone(), setting.value.clone())))
             .collect(),
         file_may_be_absent: true,
         ..Sources::default()
     };
-    let (file, tree) =
-        node_file::read_with_tree(&sources).map_err(|faults| CliError::Usage(format!("--set: {faults}")))?;
-    let settings = FlowSettings::try_from(&file).map_err(|error| CliError::Usage(format!("--set: {error}")))?;
+    let (file, tree) = node_file::read_with_tree(&sources)
+        .map_err(|faults| CliError::Usage(format!("--set: {faults}")))?;
+    let settings = FlowSettings::try_from(&file)
+        .map_err(|error| CliError::Usage(format!("--set: {error}")))?;
     Ok((settings, tree))
 }
 
@@ -157,15 +148,13 @@ fn settings_of(
 pub(super) async fn wait_ready(nodes: &Nodes) -> Result<(), CliError> {
     for running in &nodes.running {
         let name = running.node.name();
-        tokio::time::timeout(READY_TIMEOUT, running.flow.ready())
-            .await
-            .map_err(|_| {
-                let waited = READY_TIMEOUT.as_secs();
-                CliError::Failed(format!(
-                    "{name} was not ready within {waited} s; see http://{}/readyz",
-                    running.flow.admin()
-                ))
-            })?;
+        tokio::time::timeout(READY_TIMEOUT, running.flow.ready()).await.map_err(|_| {
+            let waited = READY_TIMEOUT.as_secs();
+            CliError::Failed(format!(
+                "{name} was not ready within {waited} s; see http://{}/readyz",
+                running.flow.admin()
+            ))
+        })?;
         eprintln!("ready node={name} admin={}", running.flow.admin());
     }
     Ok(())

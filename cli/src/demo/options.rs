@@ -10,7 +10,8 @@ use clap::{Args, ValueEnum};
 use crate::exit::CliError;
 
 /// Shortest and longest run.
-const DURATION_RANGE: std::ops::RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(86_400);
+const DURATION_RANGE: std::ops::RangeInclusive<Duration> =
+    Duration::from_secs(1)..=Duration::from_secs(86_400);
 
 /// Options of `blaze demo`.
 #[derive(Debug, Clone, Args)]
@@ -21,7 +22,8 @@ pub struct DemoOptions {
     /// What services talk to on each node
     #[arg(long, value_enum, default_value_t = Brokers::Memory)]
     pub brokers: Brokers,
-    /// Play these ROS 2 recordings (MCAP, CDR) instead of the built-in ones; with --only, name them in each process
+    /// Play these ROS 2 recordings (MCAP, CDR) instead of the built-in ones; with --only, name them
+    /// in each process
     #[arg(long, value_name = "FILE.mcap", num_args = 1..)]
     pub record: Vec<PathBuf>,
     /// Run these nodes only; they find the others over DDS
@@ -113,9 +115,7 @@ impl FromStr for Setting {
             .ok_or("it is KEY=VALUE, for example flow.bandwidth.limit_mbps=40")?;
         let allowed = |part: &str| {
             !part.is_empty()
-                && part
-                    .chars()
-                    .all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-'))
+                && part.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-'))
         };
         if !key.split('.').all(allowed) {
             return Err(format!(
@@ -124,14 +124,13 @@ impl FromStr for Setting {
         }
         if matches!(key.split('.').next(), Some("layer" | "node")) {
             return Err(format!(
-                "{key}: nodes have their names otherwise; the demo chooses among its own with --only, `blaze dev` has --layer and --node"
+                "{key}: nodes have their names otherwise; the demo chooses among its own with \
+                 --only, `blaze dev` has --layer and --node"
             ));
         }
-        yaml_serde::from_str::<serde_json::Value>(value).map_err(|error| format!("the value is no YAML: {error}"))?;
-        Ok(Self {
-            key: key.to_owned(),
-            value: value.to_owned(),
-        })
+        yaml_serde::from_str::<serde_json::Value>(value)
+            .map_err(|error| format!("the value is no YAML: {error}"))?;
+        Ok(Self { key: key.to_owned(), value: value.to_owned() })
     }
 }
 
@@ -155,7 +154,9 @@ impl DemoOptions {
     /// [`CliError::Usage`] with a sentence for people.
     pub fn check(&self) -> Result<(), CliError> {
         let usage = |text: &str| Err(CliError::Usage(text.to_owned()));
-        if let Some(address) = self.listen.iter().chain(&self.peer).find(|address| address.is_ipv6()) {
+        if let Some(address) =
+            self.listen.iter().chain(&self.peer).find(|address| address.is_ipv6())
+        {
             return Err(CliError::Usage(format!("{address}: DDS is carried over IPv4 only.")));
         }
         if self.listen.is_some_and(|address| address.is_unspecified()) {
@@ -198,7 +199,8 @@ mod tests {
     #[test]
     fn all_options_are_read() {
         let options = parse(
-            "--duration 1.5m --only robot-1,edge-2 --listen 10.0.1.1 --peer 10.0.3.1 --peer 10.0.4.1 \
+            "--duration 1.5m --only robot-1,edge-2 --listen 10.0.1.1 --peer 10.0.3.1 --peer \
+             10.0.4.1 \
              --set flow.bandwidth.limit_mbps=40 --record a.mcap b.mcap",
         )
         .unwrap();

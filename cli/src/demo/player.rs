@@ -64,7 +64,8 @@ impl PlayerReport {
     }
 }
 
-/// Plays until the clock says stop. `pictures` gives the JPEG messages of the schedule, decoded, in its order.
+/// Plays until the clock says stop. `pictures` gives the JPEG messages of the schedule, decoded, in
+/// its order.
 pub fn play(
     schedule: Schedule,
     clock: &mut impl Clock,
@@ -90,11 +91,7 @@ pub fn play(
             },
         };
         report.note(clock.now().saturating_sub(due.at));
-        sink(Played {
-            recording: due.recording,
-            topic: message.topic,
-            payload,
-        });
+        sink(Played { recording: due.recording, topic: message.topic, payload });
     }
     report
 }
@@ -136,31 +133,25 @@ impl Player {
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub fn start(recordings: &[Arc<Recording>], sink: impl FnMut(Played) + Send + 'static) -> std::io::Result<Self> {
+    pub fn start(
+        recordings: &[Arc<Recording>],
+        sink: impl FnMut(Played) + Send + 'static,
+    ) -> std::io::Result<Self> {
         let stop = Arc::new(StopSignal::default());
         let schedule = Schedule::new(recordings);
         let pictures = start_decoder(recordings)?;
-        let mut clock = WallClock {
-            start: Instant::now(),
-            stop: Arc::clone(&stop),
-        };
+        let mut clock = WallClock { start: Instant::now(), stop: Arc::clone(&stop) };
         let thread = std::thread::Builder::new()
             .name("player".to_owned())
             .spawn(move || play(schedule, &mut clock, || pictures.as_ref()?.recv().ok(), sink))?;
-        Ok(Self {
-            stop,
-            thread: Some(thread),
-        })
+        Ok(Self { stop, thread: Some(thread) })
     }
 
     /// Stops after the message that is being published, and says how it went.
     #[must_use]
     pub fn stop(mut self) -> PlayerReport {
         self.signal();
-        self.thread
-            .take()
-            .and_then(|thread| thread.join().ok())
-            .unwrap_or_default()
+        self.thread.take().and_then(|thread| thread.join().ok()).unwrap_or_default()
     }
 
     fn signal(&self) {
@@ -175,8 +166,11 @@ impl Drop for Player {
     }
 }
 
-/// Starts the thread that decodes what stayed JPEG, if anything did. It ends when the player has gone.
-fn start_decoder(recordings: &[Arc<Recording>]) -> std::io::Result<Option<Receiver<Result<Bytes, CameraError>>>> {
+/// Starts the thread that decodes what stayed JPEG, if anything did. It ends when the player has
+/// gone.
+fn start_decoder(
+    recordings: &[Arc<Recording>],
+) -> std::io::Result<Option<Receiver<Result<Bytes, CameraError>>>> {
     let is_jpeg = |recording: &Arc<Recording>| {
         let mut messages = recording.messages.iter();
         messages.any(|message| matches!(message.body, Body::Jpeg(_)))

@@ -58,15 +58,7 @@ fn recordings_loop_each_for_itself() {
         .collect();
     assert_eq!(
         due,
-        [
-            (0, 0, 0),
-            (0, 1, 0),
-            (10, 0, 1),
-            (15, 1, 0),
-            (20, 0, 0),
-            (30, 0, 1),
-            (30, 1, 0)
-        ]
+        [(0, 0, 0), (0, 1, 0), (10, 0, 1), (15, 1, 0), (20, 0, 0), (30, 0, 1), (30, 1, 0)]
     );
 }
 
@@ -92,14 +84,9 @@ fn lateness_is_caught_up_and_reported() {
         oversleep: vec![(milliseconds(100), milliseconds(55))],
     };
     let mut seen = Vec::new();
-    let report = play(
-        Schedule::new(&[recording(&[0], 20)]),
-        &mut clock,
-        no_pictures,
-        |played| {
-            seen.push(played.payload);
-        },
-    );
+    let report = play(Schedule::new(&[recording(&[0], 20)]), &mut clock, no_pictures, |played| {
+        seen.push(played.payload);
+    });
     // 0, 20, … 980: none is left out, though those due at 100, 120 and 140 came at 155.
     assert_eq!((report.played, seen.len()), (50, 50));
     assert_eq!(report.worst, milliseconds(55));
@@ -111,15 +98,9 @@ fn pictures_come_from_the_decoder_in_order() {
     let mut mixed = (*recording(&[0, 10, 20], 30)).clone();
     mixed.messages[1].body = Body::Jpeg(Bytes::from_static(b"one"));
     mixed.messages[2].body = Body::Jpeg(Bytes::from_static(b"two"));
-    let mut decoded = vec![
-        Err(CameraError::Jpeg("broken".to_owned())),
-        Ok(Bytes::from_static(b"picture")),
-    ];
-    let mut clock = FakeClock {
-        now: Duration::ZERO,
-        end: milliseconds(40),
-        oversleep: Vec::new(),
-    };
+    let mut decoded =
+        vec![Err(CameraError::Jpeg("broken".to_owned())), Ok(Bytes::from_static(b"picture"))];
+    let mut clock = FakeClock { now: Duration::ZERO, end: milliseconds(40), oversleep: Vec::new() };
     let mut seen = Vec::new();
     let report = play(
         Schedule::new(&[Arc::new(mixed)]),
@@ -138,10 +119,7 @@ fn a_player_stops_at_once() {
         let _ = sender.send(played.payload);
     })
     .unwrap();
-    assert_eq!(
-        receiver.recv_timeout(Duration::from_secs(10)).unwrap(),
-        Bytes::from_static(b"\0")
-    );
+    assert_eq!(receiver.recv_timeout(Duration::from_secs(10)).unwrap(), Bytes::from_static(b"\0"));
     let before = Instant::now();
     assert_eq!(player.stop().played, 1);
     assert!(

@@ -89,10 +89,7 @@ fn skipped_text(skipped: &[Skipped]) -> String {
     if skipped.is_empty() {
         return ": it holds no messages".to_owned();
     }
-    skipped
-        .iter()
-        .map(|skipped| format!("\n  {}: {}", skipped.topic, skipped.reason))
-        .collect()
+    skipped.iter().map(|skipped| format!("\n  {}: {}", skipped.topic, skipped.reason)).collect()
 }
 
 /// A topic that is in the file and not played.
@@ -186,7 +183,8 @@ const BUILT_IN: [(&str, &[u8]); 2] = [
     ("camera.mcap", include_bytes!("../../../demo/data/camera.mcap")),
 ];
 
-/// Reads the recordings that the program carries with it: IMU and odometry of a robot, and a camera.
+/// Reads the recordings that the program carries with it: IMU and odometry of a robot, and a
+/// camera.
 ///
 /// # Errors
 /// None as long as they are whole; they are part of the program.
@@ -252,26 +250,21 @@ impl<R: Read> Read for &mut Counting<R> {
 }
 
 fn read_file(path: &Path, taken: &[TopicName]) -> Result<RawRecording, RecordingError> {
-    let open_error = |error| RecordingError::Open {
-        path: path.to_owned(),
-        error,
-    };
+    let open_error = |error| RecordingError::Open { path: path.to_owned(), error };
     let file = File::open(path).map_err(open_error)?;
     let bytes = file.metadata().map_err(open_error)?.len();
     if bytes > MAX_RECORDING_BYTES {
-        return Err(RecordingError::TooLarge {
-            path: path.to_owned(),
-            bytes,
-        });
+        return Err(RecordingError::TooLarge { path: path.to_owned(), bytes });
     }
     read_records(path, BufReader::with_capacity(1 << 20, file), taken)
 }
 
-fn read_records(path: &Path, source: impl Read, taken: &[TopicName]) -> Result<RawRecording, RecordingError> {
-    let mut source = Counting {
-        inner: source,
-        count: 0,
-    };
+fn read_records(
+    path: &Path,
+    source: impl Read,
+    taken: &[TopicName],
+) -> Result<RawRecording, RecordingError> {
+    let mut source = Counting { inner: source, count: 0 };
     check_magic(path, &mut source.inner)?;
     let options = LinearReaderOptions::default()
         .with_record_length_limit(MAX_RECORD_BYTES)
@@ -296,10 +289,7 @@ fn read_records(path: &Path, source: impl Read, taken: &[TopicName]) -> Result<R
         }
         total_bytes += message.data.len() as u64;
         if total_bytes > MAX_RECORDING_BYTES {
-            return Err(RecordingError::TooLarge {
-                path: path.to_owned(),
-                bytes: total_bytes,
-            });
+            return Err(RecordingError::TooLarge { path: path.to_owned(), bytes: total_bytes });
         }
         if raw.messages.len() >= MAX_MESSAGES {
             return Err(RecordingError::TooManyMessages { path: path.to_owned() });
@@ -322,27 +312,24 @@ fn check_magic(path: &Path, source: &mut impl Read) -> Result<(), RecordingError
     source
         .take(mcap::MAGIC.len() as u64)
         .read_to_end(&mut magic)
-        .map_err(|error| RecordingError::Open {
-            path: path.to_owned(),
-            error,
-        })?;
+        .map_err(|error| RecordingError::Open { path: path.to_owned(), error })?;
     let found = match magic.as_slice() {
         found if found == mcap::MAGIC => return Ok(()),
         b"" => "the file is empty",
         found if found.starts_with(b"#ROSBAG") => {
             "is a ROS 1 bag; convert it: rosbags-convert --src FILE.bag --dst FILE.mcap"
         }
-        found if found.starts_with(b"SQLite ") => "is a rosbag2 SQLite file; convert it to MCAP: ros2 bag convert",
+        found if found.starts_with(b"SQLite ") => {
+            "is a rosbag2 SQLite file; convert it to MCAP: ros2 bag convert"
+        }
         _ => "is no MCAP file",
     };
-    Err(RecordingError::NotMcap {
-        path: path.to_owned(),
-        found,
-    })
+    Err(RecordingError::NotMcap { path: path.to_owned(), found })
 }
 
 impl RawRecording {
-    /// The topic of a channel: a new one, that of an earlier channel of the same name, or none, with a note why.
+    /// The topic of a channel: a new one, that of an earlier channel of the same name, or none,
+    /// with a note why.
     fn add_channel(&mut self, channel: &mcap::Channel<'_>, taken: &[TopicName]) -> Option<usize> {
         let schema_encoding = channel.schema.as_ref().map_or("", |schema| schema.encoding.as_str());
         let reason = match (channel.message_encoding.as_str(), schema_encoding) {
@@ -376,10 +363,7 @@ impl RawRecording {
         outcome
             .map_err(|reason| {
                 if self.skipped.len() < MAX_TOPICS {
-                    self.skipped.push(Skipped {
-                        topic: channel.topic.clone(),
-                        reason,
-                    });
+                    self.skipped.push(Skipped { topic: channel.topic.clone(), reason });
                 }
             })
             .ok()
@@ -394,10 +378,7 @@ impl RawRecording {
     ) -> Result<Recording, RecordingError> {
         self.unusable += camera::decode_topics(&mut self, taken, pictures);
         if self.messages.is_empty() {
-            return Err(RecordingError::Empty {
-                path: path.to_owned(),
-                skipped: self.skipped,
-            });
+            return Err(RecordingError::Empty { path: path.to_owned(), skipped: self.skipped });
         }
         Ok(self.finish(path))
     }
@@ -418,7 +399,8 @@ impl RawRecording {
             })
             .collect();
         let duration = messages.last().map_or(Duration::ZERO, |message| message.offset);
-        // Every topic keeps at least its own gap between the last message of a loop and the first of the next.
+        // Every topic keeps at least its own gap between the last message of a loop and the first
+        // of the next.
         let gap = paces.values().filter_map(Pace::mean_gap).max().unwrap_or(SINGLE_PERIOD);
         let period = duration + gap;
         let topics = self

@@ -76,18 +76,10 @@ fn the_jackal_recording_is_read() {
     for topic in &recording.topics {
         assert!((topic.rate_hz - 50.0).abs() < 0.1, "{topic:?}");
     }
-    let imu = recording
-        .topics
-        .iter()
-        .find(|topic| topic.name.as_str() == "imu/data")
-        .unwrap();
+    let imu = recording.topics.iter().find(|topic| topic.name.as_str() == "imu/data").unwrap();
     assert_eq!(imu.encoding, "application/cdr; type=sensor_msgs/msg/Imu");
     assert_eq!(recording.messages[0].offset, Duration::ZERO);
-    assert!(
-        (recording.period.as_secs_f64() - 61.22).abs() < 0.05,
-        "{:?}",
-        recording.period
-    );
+    assert!((recording.period.as_secs_f64() - 61.22).abs() < 0.05, "{:?}", recording.period);
     assert!(recording.messages.is_sorted_by_key(|message| message.offset));
     assert!(recording.skipped.is_empty());
 }
@@ -114,11 +106,7 @@ fn camera_pictures_are_rgb() {
     assert_eq!((topic.messages, topic.max_bytes), (90, 921_600));
     assert_eq!(topic.encoding, "application/octet-stream");
     assert!((topic.rate_hz - 30.0).abs() < 0.1);
-    assert!(
-        (recording.period.as_secs_f64() - 3.0).abs() < 0.01,
-        "{:?}",
-        recording.period
-    );
+    assert!((recording.period.as_secs_f64() - 3.0).abs() < 0.01, "{:?}", recording.period);
     for message in &recording.messages {
         assert_eq!(payload(message).len(), 640 * 480 * 3);
     }
@@ -147,9 +135,8 @@ fn pictures_beyond_the_budget_stay_jpeg() {
 
 #[test]
 fn recordings_keep_their_pace_in_any_compression() {
-    let messages: Vec<_> = (0..5)
-        .map(|index| (0, second(100) + index * 20_000_000, vec![index as u8; 9]))
-        .collect();
+    let messages: Vec<_> =
+        (0..5).map(|index| (0, second(100) + index * 20_000_000, vec![index as u8; 9])).collect();
     for compression in [None, Some(mcap::Compression::Zstd), Some(mcap::Compression::Lz4)] {
         let recording = recorded(compression, IMU, &messages);
         assert_eq!(recording.period, Duration::from_millis(100));
@@ -188,11 +175,8 @@ fn what_cannot_be_played_is_named() {
     write(&path, None, &channels, &messages);
     let recording = &load_all(std::slice::from_ref(&path)).unwrap()[0];
     assert_eq!(recording.topics.len(), 1);
-    let reasons: Vec<(&str, &SkipReason)> = recording
-        .skipped
-        .iter()
-        .map(|skipped| (skipped.topic.as_str(), &skipped.reason))
-        .collect();
+    let reasons: Vec<(&str, &SkipReason)> =
+        recording.skipped.iter().map(|skipped| (skipped.topic.as_str(), &skipped.reason)).collect();
     assert_eq!(reasons[0], ("/old", &SkipReason::Ros1));
     assert_eq!(reasons[1], ("/json", &SkipReason::Encoding("json".to_owned())));
     assert!(matches!(
@@ -202,10 +186,7 @@ fn what_cannot_be_played_is_named() {
     assert_eq!(reasons[3], ("/blaze/x", &SkipReason::Name(NameError::Reserved)));
 
     let error = load_all(&[path.clone(), path]).unwrap_err();
-    assert!(
-        error.to_string().contains("/imu/data: imu/data is played already"),
-        "{error}"
-    );
+    assert!(error.to_string().contains("/imu/data: imu/data is played already"), "{error}");
 }
 
 #[test]
@@ -254,7 +235,8 @@ fn any_damage_is_an_error_and_no_panic() {
         let mut damaged = whole.clone();
         damaged[place] ^= 0xff;
         std::fs::write(&path, damaged).unwrap();
-        // Damage in an index or a checksum of the summary may stay unseen; what is read is bounded all the same.
+        // Damage in an index or a checksum of the summary may stay unseen; what is read is bounded
+        // all the same.
         if let Ok(recordings) = load_all(std::slice::from_ref(&path)) {
             assert!(recordings[0].messages.len() <= messages.len());
         }

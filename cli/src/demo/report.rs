@@ -1,4 +1,5 @@
-//! What the demo prints: a live table on a terminal, plain lines elsewhere, JSON lines for programs.
+//! What the demo prints: a live table on a terminal, plain lines elsewhere, JSON lines for
+//! programs.
 
 use std::io::Write;
 use std::time::Duration;
@@ -41,13 +42,15 @@ impl Style {
             (Format::Table, None) => Ok(Self::Lines),
             (Format::Json, _) => Ok(Self::Json),
             (Format::Yaml, _) => Err(CliError::Usage(
-                "the demo prints a table or, with -o json, one JSON object a line; not YAML.".to_owned(),
+                "the demo prints a table or, with -o json, one JSON object a line; not YAML."
+                    .to_owned(),
             )),
         }
     }
 }
 
-/// Prints the demo's progress and end. Events go to the second writer where the first is for programs.
+/// Prints the demo's progress and end. Events go to the second writer where the first is for
+/// programs.
 pub struct Report<Out, Err> {
     style: Style,
     out: Out,
@@ -66,12 +69,7 @@ enum Line<'a> {
 impl<Out: Write, Err: Write> Report<Out, Err> {
     /// A report that has printed nothing yet.
     pub fn new(style: Style, out: Out, err: Err) -> Self {
-        Self {
-            style,
-            out,
-            err,
-            drawn: 0,
-        }
+        Self { style, out, err, drawn: 0 }
     }
 
     /// Something happened, in a sentence.
@@ -126,7 +124,8 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
     }
 
     fn json(&mut self, line: &Line<'_>) -> Result<(), CliError> {
-        let text = serde_json::to_string(line).map_err(|error| CliError::Failed(error.to_string()))?;
+        let text =
+            serde_json::to_string(line).map_err(|error| CliError::Failed(error.to_string()))?;
         write_text(&mut self.out, &format!("{text}\n"))
     }
 
@@ -236,7 +235,8 @@ fn verdict_text(summary: &Summary) -> String {
         return "OK: everything was published; nobody listens in this process.\n".to_owned();
     }
     if summary.ok {
-        return "OK: every topic arrived at every consumer here, nothing that must arrive was lost, doubled or out of \
+        return "OK: every topic arrived at every consumer here, nothing that must arrive was lost, \
+                doubled or out of \
                 order, and what was left out has its reason above.\n"
             .to_owned();
     }
@@ -245,7 +245,8 @@ fn verdict_text(summary: &Summary) -> String {
         text.push_str(&format!("  - {problem}\n"));
     }
     text.push_str(
-        "`blaze why TOPIC --flow HOST:PORT` tells while the demo runs; its nodes name their ports at the start.\n",
+        "`blaze why TOPIC --flow HOST:PORT` tells while the demo runs; its nodes name their ports \
+         at the start.\n",
     );
     text
 }

@@ -29,14 +29,13 @@ fn plain_lines_come_every_few_seconds() {
     for second in 4..=6 {
         report.rows(Duration::from_secs(second), &rows()).unwrap();
     }
-    report
-        .event(Duration::from_millis(6_500), "something happened")
-        .unwrap();
+    report.event(Duration::from_millis(6_500), "something happened").unwrap();
     assert_eq!(
         text(&report.out),
         "  5.0 s  imu/data edge/robot-1 → cloud/cloud-1 recorder: 50.0 Hz in, 49.9 Hz out, 16.1 KiB/s, p50 1.2 ms, \
          p99 4.5 ms, dropped -\n\
-         \x20 5.0 s  camera/image_raw edge/robot-1 → fog/fog-1 dashboard: 50.0 Hz in, 14.9 Hz out, 13.1 MiB/s, \
+         \x20 5.0 s  camera/image_raw edge/robot-1 → fog/fog-1 dashboard: 50.0 Hz in, 14.9 Hz out, \
+         13.1 MiB/s, \
          p50 1.2 ms, p99 4.5 ms, dropped rate_limit 15\n\
          \x20 6.5 s  something happened\n"
     );
@@ -97,10 +96,8 @@ fn json_lines_are_those_of_the_contract() {
     report.event(Duration::from_secs(1), "not for programs").unwrap();
     report.rows(Duration::from_secs(1), &rows()).unwrap();
     report.summary(&judge(good_outcome())).unwrap();
-    let lines: Vec<Value> = text(&report.out)
-        .lines()
-        .map(|line| serde_json::from_str(line).unwrap())
-        .collect();
+    let lines: Vec<Value> =
+        text(&report.out).lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(lines.len(), 3);
     let row_keys = [
         "topic",
@@ -126,10 +123,7 @@ fn json_lines_are_those_of_the_contract() {
     assert_eq!(lines[1]["dropped"]["rate_limit"], 15);
     assert_eq!(lines[0]["latency_ms"]["p99"], 4.5);
     let summary = &lines[2];
-    assert_eq!(
-        (&summary["kind"], &summary["ok"]),
-        (&Value::from("summary"), &Value::from(true))
-    );
+    assert_eq!((&summary["kind"], &summary["ok"]), (&Value::from("summary"), &Value::from(true)));
     assert_eq!(summary["duration_s"], 30.0);
     assert_eq!(summary["first_message_s"]["cloud"], 1.3);
     assert_eq!(summary["moves"][0]["gap_ms"], 0.0);
@@ -159,11 +153,13 @@ fn the_summary_says_what_was_wrong() {
          \n\
          First message after the start: cloud 1.3 s, edge 0.4 s, fog 1.2 s.\n\
          analytics moved from fog/fog-1 to cloud/cloud-1: 0 ms without a message.\n\
-         PUT service/analytics (window 50 → 10): 2xx after 1.2 ms, the callback of analytics on fog/fog-1 after 2.5 ms.\n\
+         PUT service/analytics (window 50 → 10): 2xx after 1.2 ms, the callback of analytics on \
+         fog/fog-1 after 2.5 ms.\n\
          \x20 analytics: 1.0 → 5.0 results a second.\n\
          NOT OK:\n\
          \x20 - imu/data to edge/edge-2 (monitor): 2 messages were lost\n\
-         `blaze why TOPIC --flow HOST:PORT` tells while the demo runs; its nodes name their ports at the start.\n"
+         `blaze why TOPIC --flow HOST:PORT` tells while the demo runs; its nodes name their ports \
+         at the start.\n"
     );
 }
 

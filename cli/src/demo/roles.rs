@@ -68,11 +68,7 @@ impl PlayedTopic {
     /// Pictures may be lost, everything else is repaired.
     #[must_use]
     pub fn reliability(&self) -> Reliability {
-        if self.large {
-            Reliability::BestEffort
-        } else {
-            Reliability::Reliable
-        }
+        if self.large { Reliability::BestEffort } else { Reliability::Reliable }
     }
 
     /// How long a message is of use; zero = for ever.
@@ -113,8 +109,9 @@ impl Consumer {
     }
 }
 
-/// On the edge a service talks to its node's broker, in fog and cloud to that of the layer; the one that moves keeps to its
-/// node, so that its move is seen in the bridges although others in both layers listen to the same topic.
+/// On the edge a service talks to its node's broker, in fog and cloud to that of the layer; the one
+/// that moves keeps to its node, so that its move is seen in the bridges although others in both
+/// layers listen to the same topic.
 #[must_use]
 pub fn scope_of(service: &str, node: DemoNode) -> Scope {
     match node {
@@ -126,8 +123,7 @@ pub fn scope_of(service: &str, node: DemoNode) -> Scope {
 /// The topic of the service that moves: the first that is not large, else the first.
 fn moving_topic(topics: &[PlayedTopic]) -> Option<&PlayedTopic> {
     let imu = topics.iter().find(|topic| topic.service == "imu-driver");
-    imu.or_else(|| topics.iter().find(|topic| !topic.large))
-        .or(topics.first())
+    imu.or_else(|| topics.iter().find(|topic| !topic.large)).or(topics.first())
 }
 
 /// Everybody who listens on the given nodes.
@@ -154,8 +150,5 @@ pub fn consumers(topics: &[PlayedTopic], nodes: &[DemoNode]) -> Vec<Consumer> {
             later,
         })
     });
-    steady
-        .chain(moving)
-        .filter(|consumer| nodes.contains(&consumer.node))
-        .collect()
+    steady.chain(moving).filter(|consumer| nodes.contains(&consumer.node)).collect()
 }

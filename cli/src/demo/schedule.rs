@@ -16,8 +16,8 @@ pub struct Due {
     pub message: usize,
 }
 
-/// All messages of all recordings in the order in which they are due, without end. Times are absolute, so that lateness
-/// of one message delays no later one.
+/// All messages of all recordings in the order in which they are due, without end. Times are
+/// absolute, so that lateness of one message delays no later one.
 #[derive(Debug, Clone)]
 pub struct Schedule {
     tracks: Vec<Track>,

@@ -37,7 +37,8 @@ const EVENTS: usize = 16;
 /// Runs the script and prints it. Returns what was found at the end.
 ///
 /// # Errors
-/// [`CliError::OutputClosed`] when nobody reads the report, [`CliError::Failed`] when the player cannot start.
+/// [`CliError::OutputClosed`] when nobody reads the report, [`CliError::Failed`] when the player
+/// cannot start.
 pub async fn run<S: Stage, Out: Write, Err: Write>(
     stage: &S,
     board: &Arc<Board>,
@@ -54,7 +55,9 @@ pub async fn run<S: Stage, Out: Write, Err: Write>(
     };
     for consumer in script.consumers.iter().filter(|consumer| !consumer.later) {
         let id = session.listen(consumer).await;
-        if let Some(leaves) = id.filter(|_| consumer.service == MOVING_SERVICE && consumer.node == MOVES_FROM) {
+        if let Some(leaves) =
+            id.filter(|_| consumer.service == MOVING_SERVICE && consumer.node == MOVES_FROM)
+        {
             session.moving = Moving::Later { leaves };
         }
     }
@@ -147,7 +150,8 @@ impl<S: Stage> Session<'_, S> {
             .map_err(|error| CliError::Failed(format!("the player does not start: {error}")))
     }
 
-    /// Reports each second until the time is over. Returns whether it was ended before, and why, if not by the user.
+    /// Reports each second until the time is over. Returns whether it was ended before, and why, if
+    /// not by the user.
     async fn play<Out: Write, Err: Write>(
         &mut self,
         script: &Script,
@@ -215,7 +219,10 @@ impl<S: Stage> Session<'_, S> {
         }
     }
 
-    async fn tick<Out: Write, Err: Write>(&self, report: &mut Report<Out, Err>) -> Result<(), CliError> {
+    async fn tick<Out: Write, Err: Write>(
+        &self,
+        report: &mut Report<Out, Err>,
+    ) -> Result<(), CliError> {
         self.look().await;
         let now = Instant::now();
         report.rows(now - self.start, &self.board.recent(now))
@@ -231,10 +238,13 @@ impl<S: Stage> Session<'_, S> {
         matches!(self.moving, Moving::Joining { .. })
     }
 
-    /// Whether it can leave its old place: something came to the new one, or it has waited long enough.
+    /// Whether it can leave its old place: something came to the new one, or it has waited long
+    /// enough.
     fn has_joined(&self) -> bool {
         match &self.moving {
-            Moving::Joining { joined, deadline, .. } => self.board.received(*joined) > 0 || Instant::now() >= *deadline,
+            Moving::Joining { joined, deadline, .. } => {
+                self.board.received(*joined) > 0 || Instant::now() >= *deadline
+            }
             Moving::No | Moving::Later { .. } => false,
         }
     }
@@ -275,25 +285,21 @@ impl<S: Stage> Session<'_, S> {
     }
 
     /// Leaves the old place, once it listens at the new one.
-    async fn finish_move<Out: Write, Err: Write>(&mut self, report: &mut Report<Out, Err>) -> Result<(), CliError> {
-        let Moving::Joining {
-            leaves,
-            joined,
-            topic,
-            bridges,
-            ..
-        } = std::mem::replace(&mut self.moving, Moving::No)
+    async fn finish_move<Out: Write, Err: Write>(
+        &mut self,
+        report: &mut Report<Out, Err>,
+    ) -> Result<(), CliError> {
+        let Moving::Joining { leaves, joined, topic, bridges, .. } =
+            std::mem::replace(&mut self.moving, Moving::No)
         else {
             return Ok(());
         };
         let (from, to) = (MOVES_FROM.flow(), MOVES_TO.flow());
         if self.board.received(joined) == 0 {
-            self.faults
-                .push(format!("{MOVING_SERVICE} got nothing on {to} when it moved there"));
+            self.faults.push(format!("{MOVING_SERVICE} got nothing on {to} when it moved there"));
         }
         if let Err(fault) = self.stage.stop_listening(leaves).await {
-            self.faults
-                .push(format!("{MOVING_SERVICE} cannot leave {from}: {fault}"));
+            self.faults.push(format!("{MOVING_SERVICE} cannot leave {from}: {fault}"));
         }
         self.board.end_consumer(leaves);
         let gap = self.board.moved().map_or_else(
@@ -315,13 +321,16 @@ impl<S: Stage> Session<'_, S> {
 
     /// The bridges of a topic, for people.
     async fn bridges(&self, topic: &TopicName) -> BTreeSet<String> {
-        FlowView::ask(&self.stage.admin_ports())
-            .await
-            .bridges_of(topic.as_str())
+        FlowView::ask(&self.stage.admin_ports()).await.bridges_of(topic.as_str())
     }
 
-    /// The bridges of a topic, once they differ from what they were and have settled, or after two seconds.
-    async fn bridges_after(&self, topic: &TopicName, before: &BTreeSet<String>) -> BTreeSet<String> {
+    /// The bridges of a topic, once they differ from what they were and have settled, or after two
+    /// seconds.
+    async fn bridges_after(
+        &self,
+        topic: &TopicName,
+        before: &BTreeSet<String>,
+    ) -> BTreeSet<String> {
         let deadline = Instant::now() + REFORM_LIMIT;
         let mut last = self.bridges(topic).await;
         while Instant::now() < deadline {

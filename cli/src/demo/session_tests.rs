@@ -29,11 +29,8 @@ impl Stage for Wire {
     }
 
     async fn listen(&self, consumer: &Consumer, id: ConsumerId) -> Result<(), String> {
-        let topic = self
-            .topics
-            .iter()
-            .position(|topic| *topic == consumer.topic)
-            .ok_or("no such topic")?;
+        let topic =
+            self.topics.iter().position(|topic| *topic == consumer.topic).ok_or("no such topic")?;
         self.listening.lock().entry(topic).or_default().push(id);
         Ok(())
     }
@@ -46,7 +43,8 @@ impl Stage for Wire {
     }
 
     fn publisher(&self) -> Option<Box<dyn FnMut(usize, bytes::Bytes) + Send>> {
-        let (board, listening, lose_every) = (Arc::clone(&self.board), Arc::clone(&self.listening), self.lose_every);
+        let (board, listening, lose_every) =
+            (Arc::clone(&self.board), Arc::clone(&self.listening), self.lose_every);
         let lost = Arc::clone(&self.lost);
         let (mut published, mut of_first): (u64, u64) = (0, 0);
         Some(Box::new(move |topic, payload| {
@@ -105,7 +103,8 @@ impl Stage for Wire {
 }
 
 async fn run_demo(duration: Duration, lose_every: u64) -> (Summary, String) {
-    let (summary, printed, _) = run_with(duration, lose_every, Err("no changes are shown".to_owned())).await;
+    let (summary, printed, _) =
+        run_with(duration, lose_every, Err("no changes are shown".to_owned())).await;
     (summary, printed)
 }
 
@@ -114,7 +113,8 @@ async fn run_with(
     lose_every: u64,
     changes: Result<ChangePlan, String>,
 ) -> (Summary, String, Vec<Wanted>) {
-    let recordings: Vec<Arc<Recording>> = load_built_in().unwrap().into_iter().map(Arc::new).collect();
+    let recordings: Vec<Arc<Recording>> =
+        load_built_in().unwrap().into_iter().map(Arc::new).collect();
     let topics = played_topics(recordings.iter().map(Arc::as_ref));
     let board = Arc::new(Board::new(topics.clone(), &DemoNode::ALL, Instant::now()));
     let wire = Wire {
@@ -150,18 +150,12 @@ async fn changes_come_at_their_times_and_what_they_do_is_measured() {
     };
     let (summary, printed, changed) = run_with(Duration::from_secs(8), u64::MAX, Ok(plan)).await;
     assert!(summary.ok, "{:?}", summary.problems);
-    assert_eq!(
-        changed,
-        [Wanted::Window(10), Wanted::Limit(Some(40.0)), Wanted::Limit(None)]
-    );
+    assert_eq!(changed, [Wanted::Window(10), Wanted::Limit(Some(40.0)), Wanted::Limit(None)]);
     let [service, link] = &summary.changes[..] else {
         panic!("{:?}", summary.changes);
     };
     assert!(service.after_per_s > 5.0 * service.before_per_s, "{service:?}");
-    assert_eq!(
-        (service.revision, service.accepted_ms, service.callback_ms),
-        (7, 2.0, 3.0)
-    );
+    assert_eq!((service.revision, service.accepted_ms, service.callback_ms), (7, 2.0, 3.0));
     assert!(link.before_per_s > 20.0 && link.after_per_s > 20.0, "{link:?}");
     for part in [
         "PUT service/analytics (window 50 → 10): 2xx after 2.0 ms",
@@ -180,11 +174,7 @@ async fn a_perfect_wire_is_ok() {
         11,
         "three topics on three layers, and the consumer that moved"
     );
-    let camera = summary
-        .topics
-        .iter()
-        .find(|row| row.topic == "camera/image_raw")
-        .unwrap();
+    let camera = summary.topics.iter().find(|row| row.topic == "camera/image_raw").unwrap();
     assert!(camera.received >= 60, "{camera:?}");
     assert_eq!(summary.moves[0].gap_ms, 0.0);
     let rows = printed.lines().filter(|line| line.contains("\"kind\":\"row\"")).count();

@@ -17,13 +17,18 @@ pub trait Stage {
     fn admin_ports(&self) -> Vec<(DemoNode, SocketAddr)>;
 
     /// Starts a service that listens: what it receives goes to the board under `id`.
-    fn listen(&self, consumer: &Consumer, id: ConsumerId) -> impl Future<Output = Result<(), String>>;
+    fn listen(
+        &self,
+        consumer: &Consumer,
+        id: ConsumerId,
+    ) -> impl Future<Output = Result<(), String>>;
 
     /// Ends a service that listens.
     fn stop_listening(&self, id: ConsumerId) -> impl Future<Output = Result<(), String>>;
 
     /// Publishes; called on the player's thread. Topics are counted over all recordings, see
-    /// [`played_topics`](super::roles::played_topics). `None`: the publishers are in another process.
+    /// [`played_topics`](super::roles::played_topics). `None`: the publishers are in another
+    /// process.
     fn publisher(&self) -> Option<Box<dyn FnMut(usize, bytes::Bytes) + Send>>;
 
     /// Changes the configuration over REST, and waits until whom it concerns was called back.

@@ -43,12 +43,7 @@ struct Tally {
 
 impl Tally {
     fn new(since: Instant) -> Self {
-        Self {
-            since,
-            received: 0,
-            bytes: 0,
-            latency: LatencyHistogram::default(),
-        }
+        Self { since, received: 0, bytes: 0, latency: LatencyHistogram::default() }
     }
 
     fn add(&mut self, arrival: &Arrival) {
@@ -83,12 +78,7 @@ impl ConsumerStats {
     /// Counts from now on.
     #[must_use]
     pub fn new(now: Instant) -> Self {
-        Self {
-            all: Tally::new(now),
-            recent: Tally::new(now),
-            first: None,
-            last: None,
-        }
+        Self { all: Tally::new(now), recent: Tally::new(now), first: None, last: None }
     }
 
     /// Notes one message.

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use blaze_domain::ServiceName;
 use blaze_sdk::{
-    Advertise, ConfigListener, Lease, PublishOptions, Publisher, Request, ServiceManager, ServiceOptions,
-    SubscribeOptions, Subscription,
+    Advertise, ConfigListener, Lease, PublishOptions, Publisher, Request, ServiceManager,
+    ServiceOptions, SubscribeOptions, Subscription,
 };
 use bytes::Bytes;
 use futures::future::join_all;
@@ -51,7 +51,11 @@ pub(super) struct Listener {
 
 impl System {
     /// The service of that name on that node, started with its first topic.
-    async fn service(&self, name: &'static str, node: DemoNode) -> Result<Arc<ServiceManager>, String> {
+    async fn service(
+        &self,
+        name: &'static str,
+        node: DemoNode,
+    ) -> Result<Arc<ServiceManager>, String> {
         let mut services = self.services.lock().await;
         if let Some(service) = services.get(&(name, node)) {
             return Ok(Arc::clone(service));
@@ -84,7 +88,10 @@ impl System {
         }
         for topic in self.topics.clone() {
             let (publisher, lease) = self.advertise(&topic).await.map_err(|fault| {
-                CliError::Failed(format!("{} cannot publish {}: {fault}", topic.service, topic.name))
+                CliError::Failed(format!(
+                    "{} cannot publish {}: {fault}",
+                    topic.service, topic.name
+                ))
             })?;
             self.publishers.push(publisher);
             self._advertised.push(lease);
@@ -101,10 +108,8 @@ impl System {
             large: topic.large,
             ..PublishOptions::default()
         };
-        let publisher = service
-            .broker()
-            .publisher(&topic.name, &publish)
-            .map_err(|error| error.to_string())?;
+        let publisher =
+            service.broker().publisher(&topic.name, &publish).map_err(|error| error.to_string())?;
         let advertise = Advertise {
             rate_hz: Some(topic.rate_hz),
             max_bytes: Some(topic.max_bytes as u64),
@@ -114,11 +119,7 @@ impl System {
             lifespan: topic.lifespan(),
             ..Advertise::new(topic.name.clone())
         };
-        let lease = service
-            .flow()
-            .advertise(advertise)
-            .await
-            .map_err(|error| error.to_string())?;
+        let lease = service.flow().advertise(advertise).await.map_err(|error| error.to_string())?;
         Ok((publisher, lease))
     }
 
@@ -128,13 +129,8 @@ impl System {
         drop(self.publishers);
         drop(self._advertised);
         let services = std::mem::take(&mut *self.services.lock().await);
-        join_all(
-            services
-                .into_values()
-                .filter_map(Arc::into_inner)
-                .map(ServiceManager::shutdown),
-        )
-        .await;
+        join_all(services.into_values().filter_map(Arc::into_inner).map(ServiceManager::shutdown))
+            .await;
         if let Some(configuration) = self.configuration {
             configuration.shutdown(Duration::from_secs(2)).await;
         }
@@ -163,16 +159,14 @@ impl Stage for EndableSystem {
             .ok_or("nobody plays it")?;
         let service = system.service(consumer.service, consumer.node).await?;
         let board = Arc::clone(&system.board);
-        let analytics = (consumer.service == MOVING_SERVICE).then(|| Arc::new(Analytics::default()));
+        let analytics =
+            (consumer.service == MOVING_SERVICE).then(|| Arc::new(Analytics::default()));
         let follows = analytics
             .as_ref()
             .filter(|_| system.configuration.is_some())
             .map(|analytics| analytics.follow(&service));
         let takes = analytics.clone();
-        let options = SubscribeOptions {
-            large: topic.large,
-            ..SubscribeOptions::default()
-        };
+        let options = SubscribeOptions { large: topic.large, ..SubscribeOptions::default() };
         let subscription = service
             .broker()
             .subscribe(&topic.name, options, move |message| {
@@ -192,19 +186,11 @@ impl Stage for EndableSystem {
             lifespan: topic.lifespan(),
             ..Request::new(topic.name.clone())
         };
-        let lease = service
-            .flow()
-            .request(request)
-            .await
-            .map_err(|error| error.to_string())?;
+        let lease = service.flow().request(request).await.map_err(|error| error.to_string())?;
         if let Some(analytics) = analytics {
             system.analytics.lock().insert(consumer.node, analytics);
         }
-        let listener = Listener {
-            subscription,
-            lease,
-            _follows: follows,
-        };
+        let listener = Listener { subscription, lease, _follows: follows };
         system.listeners.lock().await.insert(id, listener);
         Ok(())
     }
@@ -245,9 +231,7 @@ impl Stage for EndableSystem {
 
     async fn look(&self) {
         for (id, listener) in self.system.listeners.lock().await.iter() {
-            self.system
-                .board
-                .set_consumer_counts(*id, listener.subscription.stats());
+            self.system.board.set_consumer_counts(*id, listener.subscription.stats());
         }
     }
 
@@ -257,8 +241,6 @@ impl Stage for EndableSystem {
 }
 
 fn unix_ns() -> u64 {
-    let since_epoch = SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .unwrap_or_default();
+    let since_epoch = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since_epoch.as_nanos()).unwrap_or(u64::MAX)
 }

@@ -65,7 +65,9 @@ pub fn judge(outcome: Outcome) -> Summary {
     for row in &outcome.topics {
         judge_row(row, complete, &mut problems);
     }
-    if outcome.nodes.contains(&PUBLISHING_NODE) && outcome.topics.iter().all(|row| row.sent == Some(0)) {
+    if outcome.nodes.contains(&PUBLISHING_NODE)
+        && outcome.topics.iter().all(|row| row.sent == Some(0))
+    {
         problems.push("nothing was published".to_owned());
     }
     if complete {
@@ -100,7 +102,12 @@ pub fn judge(outcome: Outcome) -> Summary {
 }
 
 /// Every change of the plan reached whom it was for, and did what it is for.
-fn judge_changes(plan: &ChangePlan, changes: &Changes, interrupted: bool, problems: &mut Vec<String>) {
+fn judge_changes(
+    plan: &ChangePlan,
+    changes: &Changes,
+    interrupted: bool,
+    problems: &mut Vec<String>,
+) {
     problems.extend(changes.problems.iter().cloned());
     let expected = 1 + usize::from(plan.with_pictures);
     let known = changes.made.len() + changes.problems.len();
@@ -113,7 +120,8 @@ fn judge_changes(plan: &ChangePlan, changes: &Changes, interrupted: bool, proble
     }
     for change in &changes.made {
         let (before, after) = (change.before_per_s, change.after_per_s);
-        // With more of a recording's own pictures than this link takes, a narrower one lets fewer through.
+        // With more of a recording's own pictures than this link takes, a narrower one lets fewer
+        // through.
         let is_wrong = match change.effect {
             PICTURES => plan.limit_binds && (after >= before || after == 0.0),
             _ => after <= before,
@@ -131,7 +139,8 @@ fn judge_row(row: &TopicRow, complete: bool, problems: &mut Vec<String>) {
     let (Some(to), Some(service)) = (&row.to, row.service) else {
         return;
     };
-    let mut problem = |what: String| problems.push(format!("{} to {to} ({service}): {what}", row.topic));
+    let mut problem =
+        |what: String| problems.push(format!("{} to {to} ({service}): {what}", row.topic));
     if row.received == 0 {
         problem("no message arrived".to_owned());
         return;
@@ -152,22 +161,19 @@ fn judge_row(row: &TopicRow, complete: bool, problems: &mut Vec<String>) {
             problem(format!("{} messages arrived out of order", row.reordered));
         }
     } else if complete {
-        // What a flow dropped before the first or after the last message is no loss, so there may be more drops.
+        // What a flow dropped before the first or after the last message is no loss, so there may
+        // be more drops.
         let explained = explained(&row.dropped);
         if row.lost > explained {
-            problem(format!(
-                "{} pictures were lost, a reason is known for {explained}",
-                row.lost
-            ));
+            problem(format!("{} pictures were lost, a reason is known for {explained}", row.lost));
         }
     }
 }
 
 /// Drops that make a gap; what came back to its writer does not.
 fn explained(dropped: &BTreeMap<String, u64>) -> u64 {
-    let gaps = dropped
-        .iter()
-        .filter(|(reason, _)| !matches!(reason.as_str(), "echo" | "foreign_origin"));
+    let gaps =
+        dropped.iter().filter(|(reason, _)| !matches!(reason.as_str(), "echo" | "foreign_origin"));
     gaps.map(|(_, count)| count).sum()
 }
 

@@ -19,10 +19,7 @@ pub(in crate::demo) fn good_row(topic: &str, node: DemoNode, service: &'static s
         duplicated: 0,
         reordered: 0,
         dropped: BTreeMap::new(),
-        latency_ms: LatencyMs {
-            p50: Some(1.25),
-            p99: Some(4.5),
-        },
+        latency_ms: LatencyMs { p50: Some(1.25), p99: Some(4.5) },
         large,
         active: true,
         silent: Some(Duration::from_millis(20)),
@@ -53,11 +50,7 @@ pub(in crate::demo) fn good_outcome() -> Outcome {
             gap_ms: 0.0,
         }),
         topics,
-        plan: Some(ChangePlan {
-            limit_mbps: 160.0,
-            with_pictures: true,
-            limit_binds: true,
-        }),
+        plan: Some(ChangePlan { limit_mbps: 160.0, with_pictures: true, limit_binds: true }),
         changes: Changes {
             made: vec![good_change("results", 1.0, 5.0), good_change(PICTURES, 12.0, 3.0)],
             problems: Vec::new(),
@@ -98,28 +91,20 @@ fn each_fault_is_found() {
             "imu/data to edge/edge-2 (monitor): 1 messages were lost",
         ),
         (|outcome| outcome.topics[1].duplicated = 2, "2 messages arrived twice"),
-        (
-            |outcome| outcome.topics[1].reordered = 3,
-            "3 messages arrived out of order",
-        ),
+        (|outcome| outcome.topics[1].reordered = 3, "3 messages arrived out of order"),
         (|outcome| outcome.topics[2].duplicated = 1, "1 messages arrived twice"),
         (|outcome| outcome.topics[2].lost = 5, "a reason is known for 0"),
         (
             |outcome| {
                 outcome.topics[2].lost = 5;
-                outcome.topics[2].dropped = BTreeMap::from([("echo".to_owned(), 9), ("lifespan".to_owned(), 4)]);
+                outcome.topics[2].dropped =
+                    BTreeMap::from([("echo".to_owned(), 9), ("lifespan".to_owned(), 4)]);
             },
             "a reason is known for 4",
         ),
         (|outcome| outcome.topics[8].received = 0, "no message arrived"),
-        (
-            |outcome| outcome.topics[8].silent = Some(Duration::from_secs(4)),
-            "in the last 4.0 s",
-        ),
-        (
-            |outcome| *outcome.first_message_s.get_mut("cloud").unwrap() = 10.5,
-            "after 10.5 s",
-        ),
+        (|outcome| outcome.topics[8].silent = Some(Duration::from_secs(4)), "in the last 4.0 s"),
+        (|outcome| *outcome.first_message_s.get_mut("cloud").unwrap() = 10.5, "after 10.5 s"),
         (|outcome| outcome.moved = None, "did not move"),
         (
             |outcome| {
@@ -137,10 +122,7 @@ fn each_fault_is_found() {
             |outcome| outcome.changes.made[0].after_per_s = 1.0,
             "window of analytics did not do what it should: 1.0 → 1.0 results a second",
         ),
-        (
-            |outcome| outcome.changes.made[1].after_per_s = 12.5,
-            "12.0 → 12.5 pictures a second",
-        ),
+        (|outcome| outcome.changes.made[1].after_per_s = 12.5, "12.0 → 12.5 pictures a second"),
         (
             |outcome| {
                 outcome.changes.made.truncate(1);
@@ -184,8 +166,5 @@ fn a_part_of_the_demo_answers_for_itself_alone() {
     outcome.first_message_s = BTreeMap::from([("cloud", 40.0)]);
     outcome.plan = None;
     outcome.changes = Changes::default();
-    assert!(
-        judge(outcome).ok,
-        "when the others start, and why they drop, is not known here"
-    );
+    assert!(judge(outcome).ok, "when the others start, and why they drop, is not known here");
 }

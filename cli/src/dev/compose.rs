@@ -45,7 +45,11 @@ pub(super) struct Dev {
 }
 
 /// Starts everything and waits until it is ready.
-pub(super) async fn start(options: &DevOptions, sources: &[Source], supervisor: &Supervisor) -> Result<Dev, CliError> {
+pub(super) async fn start(
+    options: &DevOptions,
+    sources: &[Source],
+    supervisor: &Supervisor,
+) -> Result<Dev, CliError> {
     // Faults of the options are told before anything runs.
     let (file, _) = options.node_file(None, None)?;
     instance()?;
@@ -62,7 +66,8 @@ pub(super) async fn start(options: &DevOptions, sources: &[Source], supervisor: 
     let (file, tree) = options.node_file(redis.as_deref(), Some(addresses.grpc))?;
     let brokers = Brokers::of(&file, options);
     let folder = options.data.as_ref().map(|folder| folder.join("worker"));
-    let worker = Worker::start(&file, brokers.open(&Role::Worker)?, folder, true, supervisor).await?;
+    let worker =
+        Worker::start(&file, brokers.open(&Role::Worker)?, folder, true, supervisor).await?;
     let flow = Arc::new(start_flow(&file, &brokers, options.data.as_deref(), supervisor).await?);
     let service = follow(&flow, &tree, file.cache_redis(), Some(log), supervisor, |_| {}).await?;
     worker.has(revision, READY).await?;
@@ -72,25 +77,23 @@ pub(super) async fn start(options: &DevOptions, sources: &[Source], supervisor: 
             "the flow was not ready within {waited} s; see http://{admin}/readyz"
         ))
     })?;
-    Ok(Dev {
-        main,
-        addresses,
-        worker: Arc::new(worker),
-        flow,
-        service,
-        redis,
-    })
+    Ok(Dev { main, addresses, worker: Arc::new(worker), flow, service, redis })
 }
 
 /// URL of the Redis, which is started where that is asked for; `None`: memory.
-async fn broker_of(options: &DevOptions, supervisor: &Supervisor) -> Result<Option<String>, CliError> {
+async fn broker_of(
+    options: &DevOptions,
+    supervisor: &Supervisor,
+) -> Result<Option<String>, CliError> {
     match &options.broker {
         Some(DevBroker::Memory) => Ok(None),
         Some(DevBroker::Redis(url)) => Ok(Some(url.clone())),
         Some(DevBroker::OwnRedis) => match redis::start(supervisor).await? {
             Some(url) => Ok(Some(url)),
             None => Err(CliError::Usage(
-                "--broker redis: there is no redis-server in PATH. Install it (Debian, Ubuntu: `apt install redis-server`), or give --broker redis://HOST:PORT of one that runs, or --broker memory."
+                "--broker redis: there is no redis-server in PATH. Install it (Debian, Ubuntu: \
+                 `apt install redis-server`), or give --broker redis://HOST:PORT of one that runs, \
+                 or --broker memory."
                     .to_owned(),
             )),
         },
@@ -98,7 +101,9 @@ async fn broker_of(options: &DevOptions, supervisor: &Supervisor) -> Result<Opti
             let started = redis::start(supervisor).await?;
             if started.is_none() {
                 eprintln!(
-                    "blaze: there is no redis-server in PATH, so the broker is inside this process: services of other processes cannot reach it. Give --broker redis://HOST:PORT."
+                    "blaze: there is no redis-server in PATH, so the broker is inside this \
+                     process: services of other processes cannot reach it. Give --broker \
+                     redis://HOST:PORT."
                 );
             }
             Ok(started)
@@ -107,7 +112,11 @@ async fn broker_of(options: &DevOptions, supervisor: &Supervisor) -> Result<Opti
 }
 
 /// Layer and node, unless they are there, and what `-f` says. Gives the revision after it.
-async fn documents(options: &DevOptions, sources: &[Source], rest: SocketAddr) -> Result<u64, CliError> {
+async fn documents(
+    options: &DevOptions,
+    sources: &[Source],
+    rest: SocketAddr,
+) -> Result<u64, CliError> {
     let own = [
         json!({ "kind": "Layer", "name": options.layer, "spec": { "kind": options.kind() } }),
         json!({ "kind": "Node", "name": options.node, "spec": { "layer": options.layer } }),
@@ -130,11 +139,7 @@ struct Brokers {
 impl Brokers {
     fn of(file: &NodeFile, options: &DevOptions) -> Self {
         Self {
-            section: file
-                .brokers
-                .node
-                .clone()
-                .filter(|section| *section != NodeBroker::Memory),
+            section: file.brokers.node.clone().filter(|section| *section != NodeBroker::Memory),
             hub: MemoryHub::new(options.node.to_string()),
         }
     }
@@ -142,9 +147,8 @@ impl Brokers {
     fn open(&self, role: &Role) -> Result<Arc<dyn Broker>, CliError> {
         match &self.section {
             None => Ok(Arc::new(self.hub.broker())),
-            Some(section) => {
-                open_node(section, role).map_err(|error| CliError::Failed(format!("brokers.node: {error}")))
-            }
+            Some(section) => open_node(section, role)
+                .map_err(|error| CliError::Failed(format!("brokers.node: {error}"))),
         }
     }
 }
@@ -156,22 +160,14 @@ async fn start_flow(
     supervisor: &Supervisor,
 ) -> Result<RunningFlow, CliError> {
     let failed = |error: String| CliError::Failed(format!("the flow does not start: {error}"));
-    let settings = FlowSettings::try_from(file).map_err(|error| CliError::Usage(error.to_string()))?;
-    let epochs = Epochs::begin(&settings.me, folder).map_err(|error| failed(format!("its epoch: {error}")))?;
-    let role = Role::Flow {
-        flow: FlowId::clone(&settings.me),
-        epoch: epochs.first(),
-    };
-    let options = FlowOptions {
-        settings,
-        node: Some(brokers.open(&role)?),
-        layer: None,
-        state_dir: None,
-    };
-    let beginning = Beginning {
-        epochs,
-        layer_prefix: String::new(),
-    };
+    let settings =
+        FlowSettings::try_from(file).map_err(|error| CliError::Usage(error.to_string()))?;
+    let epochs = Epochs::begin(&settings.me, folder)
+        .map_err(|error| failed(format!("its epoch: {error}")))?;
+    let role = Role::Flow { flow: FlowId::clone(&settings.me), epoch: epochs.first() };
+    let options =
+        FlowOptions { settings, node: Some(brokers.open(&role)?), layer: None, state_dir: None };
+    let beginning = Beginning { epochs, layer_prefix: String::new() };
     let flow = blaze_flow::flow::start_with(options, beginning, supervisor.child("flow")).await;
     flow.map_err(|error| failed(format!("{error:#}")))
 }
@@ -195,8 +191,11 @@ impl Dev {
     pub(super) fn to_try(&self, options: &DevOptions) -> String {
         let (rest, flow, node) = (self.addresses.rest, self.flow.admin(), &options.node);
         let server = format!("http://{rest}");
-        let service =
-            json!({ "kind": "Service", "name": "slam", "spec": { "config": { "camera": { "rate_hz": 10 } } } });
+        let service = json!({
+            "kind": "Service",
+            "name": "slam",
+            "spec": { "config": { "camera": { "rate_hz": 10 } } },
+        });
         let services = match &self.redis {
             Some(url) => format!(
                 "  redis-cli -u {url} subscribe blaze/config/changed/slam   # what your service hears\n  redis-cli -u {url} get blaze:config:slam                 # what it finds when it starts\n"
@@ -211,13 +210,7 @@ impl Dev {
 
     /// Ends everything in order.
     pub(super) async fn shutdown(self, supervisor: &Supervisor, deadline: Duration) {
-        let Self {
-            main,
-            worker,
-            flow,
-            service,
-            ..
-        } = self;
+        let Self { main, worker, flow, service, .. } = self;
         let readiness = flow.readiness().clone();
         let steps = ShutdownSteps::new(deadline)
             .on(ShutdownPhase::NotReady, "flow", async move { readiness.stop() })

@@ -1,4 +1,5 @@
-//! `blaze dev`: main service, worker, flow and broker of one node in one process, for those who develop services.
+//! `blaze dev`: main service, worker, flow and broker of one node in one process, for those who
+//! develop services.
 //!
 //! ```text
 //! REST, gRPC ─► main service ─► worker ─► broker (Redis, memory) ◄─► the service that is being developed
@@ -40,7 +41,8 @@ pub async fn run(options: DevOptions, format: Format) -> Result<Exit, CliError> 
     let ends = Ends::new(supervisor.clone())?;
     let outcome = tokio::select! {
         outcome = start(&options, &sources, &supervisor) => outcome,
-        reason = ends.wait() => Err(CliError::Failed(reason.unwrap_or_else(|| "stopped before it began".to_owned()))),
+        reason = ends.wait() => Err(CliError::Failed(reason.unwrap_or_else(|| "stopped before it \
+            began".to_owned()))),
     };
     let dev = match outcome {
         Ok(dev) => dev,
@@ -71,7 +73,8 @@ fn tell(dev: &Dev, options: &DevOptions, format: Format) -> Result<(), CliError>
     let places = dev.places();
     match format {
         Format::Table => {
-            let words: Vec<String> = places.iter().map(|(name, place)| format!("{name}={place}")).collect();
+            let words: Vec<String> =
+                places.iter().map(|(name, place)| format!("{name}={place}")).collect();
             print(&format!("ready {}", words.join(" ")))?;
             eprint!("{}", dev.to_try(options));
             Ok(())
@@ -81,7 +84,8 @@ fn tell(dev: &Dev, options: &DevOptions, format: Format) -> Result<(), CliError>
             print(&serde_json::Value::Object(members.collect()).to_string())
         }
         Format::Yaml => Err(CliError::Usage(
-            "`blaze dev` says where everything is as a line or, with -o json, as an object; not as YAML.".to_owned(),
+            "`blaze dev` says where everything is as a line or, with -o json, as an object; not as \
+             YAML.".to_owned(),
         )),
     }
 }

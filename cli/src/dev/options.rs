@@ -23,7 +23,9 @@ pub struct DevOptions {
     /// Name of the node
     #[arg(long, value_name = "NAME", default_value = "dev-1")]
     pub node: NodeName,
-    /// What services talk to: redis (one of its own, which redis-server from PATH is started for), redis://HOST:PORT, or memory (within this process alone); else redis if there is a redis-server
+    /// What services talk to: redis (one of its own, which redis-server from PATH is started for),
+    /// redis://HOST:PORT, or memory (within this process alone); else redis if there is a
+    /// redis-server
     #[arg(long, value_name = "BROKER")]
     pub broker: Option<DevBroker>,
     /// Where REST listens, on loopback; port 0: any free one
@@ -62,7 +64,8 @@ impl FromStr for DevBroker {
             "redis" => Ok(Self::OwnRedis),
             // It would stand in the list of processes and in what is printed.
             url if has_password(url) => {
-                Err("a password does not belong here: --set brokers.node.redis.password_file=FILE".to_owned())
+                Err("a password does not belong here: --set brokers.node.redis.password_file=FILE"
+                    .to_owned())
             }
             url if is_redis(url) => Ok(Self::Redis(url.to_owned())),
             _ => Err("it is memory, redis or redis://HOST:PORT".to_owned()),
@@ -81,7 +84,8 @@ impl DevOptions {
         }
     }
 
-    /// The node file: what the options say, and over it `--set`. The worker asks `grpc` once that is known.
+    /// The node file: what the options say, and over it `--set`. The worker asks `grpc` once that
+    /// is known.
     ///
     /// # Errors
     /// [`CliError::Usage`] with every fault.
@@ -110,16 +114,14 @@ impl DevOptions {
             own.push(("config.server", json!(format!("http://{grpc}"))));
         }
         let of_options = own.into_iter().map(|(key, value)| (key.to_owned(), value.to_string()));
-        let set = self
-            .set
-            .iter()
-            .map(|setting| (setting.key.clone(), setting.value.clone()));
+        let set = self.set.iter().map(|setting| (setting.key.clone(), setting.value.clone()));
         let sources = Sources {
             overrides: of_options.chain(set).collect(),
             file_may_be_absent: true,
             ..Sources::default()
         };
-        node_file::read_with_tree(&sources).map_err(|faults| CliError::Usage(format!("--set: {faults}")))
+        node_file::read_with_tree(&sources)
+            .map_err(|faults| CliError::Usage(format!("--set: {faults}")))
     }
 
     fn store(&self, folder: &Path) -> PathBuf {

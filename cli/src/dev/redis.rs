@@ -1,4 +1,5 @@
-//! A Redis of one's own: `redis-server` from PATH on a free port of loopback, which ends with this process.
+//! A Redis of one's own: `redis-server` from PATH on a free port of loopback, which ends with this
+//! process.
 
 use std::io::ErrorKind;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
@@ -26,7 +27,8 @@ const TRIES: usize = 3;
 pub(super) async fn start(supervisor: &Supervisor) -> Result<Option<String>, CliError> {
     let mut told = String::new();
     for _ in 0..TRIES {
-        let port = free_port().map_err(|error| CliError::Failed(format!("no free port: {error}")))?;
+        let port =
+            free_port().map_err(|error| CliError::Failed(format!("no free port: {error}")))?;
         let Some(child) = launch(port)? else {
             return Ok(None);
         };
@@ -60,7 +62,8 @@ fn launch(port: u16) -> Result<Option<Child>, CliError> {
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .kill_on_drop(true)
-        // Ctrl-C on a terminal goes to the whole group: it would be gone before what it carries has drained.
+        // Ctrl-C on a terminal goes to the whole group: it would be gone before what it carries has
+        // drained.
         .process_group(0);
     match command.spawn() {
         Ok(child) => Ok(Some(child)),
@@ -81,10 +84,7 @@ async fn listening(mut child: Child, port: u16) -> Result<Child, String> {
             return Ok(child);
         }
         if start.elapsed() > START {
-            return Err(format!(
-                "it does not listen on port {port} within {} s",
-                START.as_secs()
-            ));
+            return Err(format!("it does not listen on port {port} within {} s", START.as_secs()));
         }
         sleep(LOOK).await;
     }

@@ -48,14 +48,16 @@ pub async fn run(options: EchoOptions, format: Format) -> Result<Exit, CliError>
     outcome.map(|()| Exit::Done)
 }
 
-async fn print_all(service: &LocalService, options: &EchoOptions, format: Format) -> Result<(), CliError> {
+async fn print_all(
+    service: &LocalService,
+    options: &EchoOptions,
+    format: Format,
+) -> Result<(), CliError> {
     let (tell, mut told) = mpsc::channel(WAITING);
     let dropped = Arc::new(AtomicU64::new(0));
     let counted = Arc::clone(&dropped);
-    let subscribe = SubscribeOptions {
-        max_rate_hz: options.max_rate,
-        ..SubscribeOptions::default()
-    };
+    let subscribe =
+        SubscribeOptions { max_rate_hz: options.max_rate, ..SubscribeOptions::default() };
     let request = Request {
         max_rate_hz: options.max_rate,
         reliability: reliability(options.reliable),
@@ -86,7 +88,9 @@ async fn print_all(service: &LocalService, options: &EchoOptions, format: Format
     drop(subscription);
     let lost = dropped.load(Ordering::Relaxed);
     if lost > 0 {
-        eprintln!("blaze: {lost} messages came faster than they could be printed and were left out");
+        eprintln!(
+            "blaze: {lost} messages came faster than they could be printed and were left out"
+        );
     }
     Ok(())
 }
@@ -94,9 +98,11 @@ async fn print_all(service: &LocalService, options: &EchoOptions, format: Format
 fn describe(message: &Message, format: Format) -> Result<String, CliError> {
     match format {
         Format::Table => Ok(line(message)),
-        Format::Json => serde_json::to_string(&value(message)).map_err(|error| CliError::Failed(error.to_string())),
+        Format::Json => serde_json::to_string(&value(message))
+            .map_err(|error| CliError::Failed(error.to_string())),
         Format::Yaml => {
-            let text = yaml_serde::to_string(&value(message)).map_err(|error| CliError::Failed(error.to_string()))?;
+            let text = yaml_serde::to_string(&value(message))
+                .map_err(|error| CliError::Failed(error.to_string()))?;
             Ok(format!("---\n{text}"))
         }
     }
@@ -105,7 +111,8 @@ fn describe(message: &Message, format: Format) -> Result<String, CliError> {
 fn value(message: &Message) -> Value {
     let origin = message.origin();
     let mut value = json!({
-        "topic": message.topic(), "layer": origin.layer, "node": origin.node, "service": origin.service,
+        "topic": message.topic(), "layer": origin.layer, "node": origin.node,
+        "service": origin.service,
         "instance": origin.instance, "writer": message.writer().map(|writer| writer.to_string()),
         "sequence": message.sequence(), "hops": message.hops(),
         "age_ms": (message.age().as_secs_f64() * 1e6).round() / 1e3,
@@ -129,10 +136,7 @@ fn line(message: &Message) -> String {
         .map(String::as_str)
         .collect::<Vec<_>>()
         .join("/");
-    let number = message
-        .sequence()
-        .map(|sequence| format!(" #{sequence}"))
-        .unwrap_or_default();
+    let number = message.sequence().map(|sequence| format!(" #{sequence}")).unwrap_or_default();
     let age = message.age().as_secs_f64() * 1e3;
     let payload = message.payload();
     let shown = match std::str::from_utf8(payload) {
@@ -145,11 +149,7 @@ fn line(message: &Message) -> String {
         Err(_) => format!(
             "{} bytes of {}",
             payload.len(),
-            if message.encoding().is_empty() {
-                "no text"
-            } else {
-                message.encoding()
-            }
+            if message.encoding().is_empty() { "no text" } else { message.encoding() }
         ),
     };
     let from = if from.is_empty() { "(no header)" } else { &from };

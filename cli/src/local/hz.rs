@@ -62,7 +62,11 @@ pub async fn run(options: HzOptions, format: Format) -> Result<Exit, CliError> {
     outcome.map(|()| Exit::Done)
 }
 
-async fn measure(service: &LocalService, options: &HzOptions, format: Format) -> Result<(), CliError> {
+async fn measure(
+    service: &LocalService,
+    options: &HzOptions,
+    format: Format,
+) -> Result<(), CliError> {
     let topic = &options.target.topic;
     let arrivals: Arc<Mutex<VecDeque<Arrival>>> = Arc::default();
     let noted = Arc::clone(&arrivals);
@@ -95,10 +99,12 @@ async fn measure(service: &LocalService, options: &HzOptions, format: Format) ->
                 let now = Instant::now();
                 let figures = {
                     let mut arrivals = arrivals.lock();
-                    while arrivals.front().is_some_and(|arrival| now.saturating_duration_since(arrival.at) > window) {
+                    while arrivals.front()
+                        .is_some_and(|arrival| now.saturating_duration_since(arrival.at) > window) {
                         arrivals.pop_front();
                     }
-                    figures(arrivals.make_contiguous(), window.min(now.saturating_duration_since(begin)))
+                    figures(arrivals.make_contiguous(),
+                        window.min(now.saturating_duration_since(begin)))
                 };
                 output::print(&describe(topic.as_str(), &figures, &subscription.stats(), format)?)?;
                 printed += 1;
@@ -127,14 +133,20 @@ fn figures(arrivals: &[Arrival], window: Duration) -> Figures {
     Figures {
         messages: arrivals.len(),
         // From the mean gap where there is one: a window that has just begun would say too little.
-        rate_hz: gaps.map_or(arrivals.len() as f64 / seconds, |(_, mean, _, _)| 1.0 / mean.max(1e-9)),
+        rate_hz: gaps
+            .map_or(arrivals.len() as f64 / seconds, |(_, mean, _, _)| 1.0 / mean.max(1e-9)),
         bytes_per_s: arrivals.iter().map(|arrival| arrival.bytes as f64).sum::<f64>() / seconds,
         gaps,
         age_p50_ms: ages.get(ages.len() / 2).map(|age| age.as_secs_f64() * 1e3),
     }
 }
 
-fn describe(topic: &str, figures: &Figures, stats: &SubscriptionStats, format: Format) -> Result<String, CliError> {
+fn describe(
+    topic: &str,
+    figures: &Figures,
+    stats: &SubscriptionStats,
+    format: Format,
+) -> Result<String, CliError> {
     if format == Format::Table {
         let Some((shortest, _, longest, deviation)) = figures.gaps else {
             return Ok(format!(
@@ -155,7 +167,8 @@ fn describe(topic: &str, figures: &Figures, stats: &SubscriptionStats, format: F
     }
     let milliseconds = |seconds: f64| json!((seconds * 1e6).round() / 1e3);
     let value = json!({
-        "topic": topic, "rate_hz": (figures.rate_hz * 1e3).round() / 1e3, "messages": figures.messages,
+        "topic": topic, "rate_hz": (figures.rate_hz * 1e3).round() / 1e3,
+        "messages": figures.messages,
         "bytes_per_s": figures.bytes_per_s.round(),
         "gap_ms": figures.gaps.map(|(shortest, mean, longest, deviation)| json!({
             "min": milliseconds(shortest), "mean": milliseconds(mean), "max": milliseconds(longest),
@@ -165,9 +178,13 @@ fn describe(topic: &str, figures: &Figures, stats: &SubscriptionStats, format: F
         "duplicated": stats.duplicated,
     });
     match format {
-        Format::Json => serde_json::to_string(&value).map_err(|error| CliError::Failed(error.to_string())),
-        Format::Table | Format::Yaml => output::format_object(&value, Format::Yaml, |_: &Value| Ok(String::new()))
-            .map(|text| format!("---\n{text}")),
+        Format::Json => {
+            serde_json::to_string(&value).map_err(|error| CliError::Failed(error.to_string()))
+        }
+        Format::Table | Format::Yaml => {
+            output::format_object(&value, Format::Yaml, |_: &Value| Ok(String::new()))
+                .map(|text| format!("---\n{text}"))
+        }
     }
 }
 
@@ -195,11 +212,7 @@ mod tests {
     #[test]
     fn one_or_no_message_has_no_gaps() {
         assert_eq!(figures(&[], Duration::from_secs(1)), Figures::default());
-        let one = Arrival {
-            at: Instant::now(),
-            bytes: 10,
-            age: Duration::ZERO,
-        };
+        let one = Arrival { at: Instant::now(), bytes: 10, age: Duration::ZERO };
         let found = figures(&[one], Duration::from_secs(2));
         assert_eq!((found.gaps, found.rate_hz), (None, 0.5));
     }

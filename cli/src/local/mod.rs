@@ -16,7 +16,10 @@ use blaze_brokers::{Broker, BrokerKind, Health, OpenError, Role, open_layer, ope
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_domain::{InstanceName, Reliability, Scope, ServiceName, TopicName};
 use blaze_runtime::config::Sources;
-use blaze_sdk::{FlowError, Lease, Message, Request, ServiceManager, ServiceOptions, SubscribeOptions, Subscription};
+use blaze_sdk::{
+    FlowError, Lease, Message, Request, ServiceManager, ServiceOptions, SubscribeOptions,
+    Subscription,
+};
 use clap::Args;
 
 use crate::args::parse_topic;
@@ -67,11 +70,13 @@ impl LocalService {
             .ok_or_else(|| CliError::Invalid("the node file names no layer and node".to_owned()))?;
         let (broker, scope) = open(&file)?;
         wait_until_up(&broker).await?;
-        let fault = |what: &str, error: &dyn std::fmt::Display| CliError::Failed(format!("{what}: {error}"));
-        let service: ServiceName = format!("blaze-{command}").parse().map_err(|e| fault("service", &e))?;
-        let instance: InstanceName = format!("p{}", std::process::id())
-            .parse()
-            .map_err(|e| fault("instance", &e))?;
+        let fault = |what: &str, error: &dyn std::fmt::Display| {
+            CliError::Failed(format!("{what}: {error}"))
+        };
+        let service: ServiceName =
+            format!("blaze-{command}").parse().map_err(|e| fault("service", &e))?;
+        let instance: InstanceName =
+            format!("p{}", std::process::id()).parse().map_err(|e| fault("instance", &e))?;
         let options = ServiceOptions {
             instance,
             control_timeout: ANSWER_WITHIN,
@@ -92,9 +97,11 @@ impl LocalService {
     ) -> Result<(Subscription, Lease), CliError> {
         let topic = request.topic.clone();
         let subscribed = self.manager.broker().subscribe(&topic, options, take).await;
-        let subscription = subscribed.map_err(|error| CliError::Failed(format!("subscribe {topic}: {error}")))?;
+        let subscription =
+            subscribed.map_err(|error| CliError::Failed(format!("subscribe {topic}: {error}")))?;
         let requested = self.manager.flow().request(request).await;
-        let lease = requested.map_err(|error| lease_error("request", &topic, self.broker.kind(), &error))?;
+        let lease = requested
+            .map_err(|error| lease_error("request", &topic, self.broker.kind(), &error))?;
         Ok((subscription, lease))
     }
 
@@ -108,17 +115,21 @@ impl LocalService {
 fn open(file: &NodeFile) -> Result<(Arc<dyn Broker>, Scope), CliError> {
     let role = Role::Service;
     match (&file.brokers.node, &file.brokers.layer) {
-        (Some(NodeBroker::Memory), _) | (None, Some(LayerBroker::Memory)) => Err(CliError::Usage(format!(
-            "brokers: {}. Name redis, kafka or dds in the node file.",
-            OpenError::InProcess
-        ))),
-        (Some(node), _) => Ok((open_node(node, &role).map_err(|e| refused("node", &e))?, Scope::Node)),
-        (None, Some(layer)) => Ok((
-            open_layer(layer, &role).map_err(|e| refused("layer", &e))?,
-            Scope::Layer,
-        )),
+        (Some(NodeBroker::Memory), _) | (None, Some(LayerBroker::Memory)) => {
+            Err(CliError::Usage(format!(
+                "brokers: {}. Name redis, kafka or dds in the node file.",
+                OpenError::InProcess
+            )))
+        }
+        (Some(node), _) => {
+            Ok((open_node(node, &role).map_err(|e| refused("node", &e))?, Scope::Node))
+        }
+        (None, Some(layer)) => {
+            Ok((open_layer(layer, &role).map_err(|e| refused("layer", &e))?, Scope::Layer))
+        }
         (None, None) => Err(CliError::Usage(
-            "the node file names neither brokers.node nor brokers.layer: there is no local broker".to_owned(),
+            "the node file names neither brokers.node nor brokers.layer: there is no local broker"
+                .to_owned(),
         )),
     }
 }
@@ -126,7 +137,9 @@ fn open(file: &NodeFile) -> Result<(Arc<dyn Broker>, Scope), CliError> {
 fn refused(scope: &str, error: &OpenError) -> CliError {
     match error {
         OpenError::Setting { .. } => CliError::Invalid(format!("brokers.{scope}.{error}")),
-        OpenError::NotBuilt { .. } | OpenError::InProcess => CliError::Usage(format!("brokers.{scope}: {error}")),
+        OpenError::NotBuilt { .. } | OpenError::InProcess => {
+            CliError::Usage(format!("brokers.{scope}: {error}"))
+        }
     }
 }
 
@@ -152,9 +165,13 @@ fn lease_error(what: &str, topic: &TopicName, kind: BrokerKind, error: &FlowErro
         FlowError::NoAnswer { .. } => CliError::NoBroker {
             kind: format!("flow on {kind}"),
             waited_s: ANSWER_WITHIN.as_secs(),
-            detail: format!("{what} {topic}: {error}. Is blaze-flow running on this broker? See its /readyz."),
+            detail: format!(
+                "{what} {topic}: {error}. Is blaze-flow running on this broker? See its /readyz."
+            ),
         },
-        FlowError::Refused { .. } | FlowError::Invalid { .. } => CliError::Invalid(format!("{what} {topic}: {error}")),
+        FlowError::Refused { .. } | FlowError::Invalid { .. } => {
+            CliError::Invalid(format!("{what} {topic}: {error}"))
+        }
         _ => CliError::Failed(format!("{what} {topic}: {error}")),
     }
 }

@@ -40,7 +40,8 @@ pub struct PublishOptions {
     /// Ask that lost messages are sent again
     #[arg(long)]
     pub reliable: bool,
-    /// How long to wait for a bridge before the first message; volatile messages that nobody carries yet are gone
+    /// How long to wait for a bridge before the first message; volatile messages that nobody
+    /// carries yet are gone
     #[arg(long, value_name = "SECONDS", default_value_t = 1.0)]
     pub wait: f64,
 }
@@ -111,7 +112,8 @@ async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sen
     route_up(&mut events, options).await;
     let mut sent = tokio::select! {
         sent = feed(options, &publisher) => sent?,
-        stopped = interrupted() => { stopped?; Sent { published: publisher.sequence(), dropped: 0 } }
+        stopped = interrupted() =>
+            { stopped?; Sent { published: publisher.sequence(), dropped: 0 } }
     };
     // What was taken leaves before the lease ends, because a bridge ends with its lease.
     let until = Instant::now() + Duration::from_secs(5);
@@ -125,7 +127,8 @@ async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sen
     Ok(sent)
 }
 
-/// Waits until a bridge begins to carry the topic, at most `--wait`. One that carried it before tells nothing.
+/// Waits until a bridge begins to carry the topic, at most `--wait`. One that carried it before
+/// tells nothing.
 async fn route_up(events: &mut FlowEvents, options: &PublishOptions) {
     let wait = Duration::try_from_secs_f64(options.wait).unwrap_or(Duration::ZERO);
     let until = Instant::now() + wait;
@@ -147,10 +150,7 @@ async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, C
     let most = options.count.unwrap_or(if endless { u64::MAX } else { 1 });
     let mut lines = (options.payload == "-").then(lines_of_input);
     let fixed = Bytes::from(options.payload.clone());
-    let mut sent = Sent {
-        published: 0,
-        dropped: 0,
-    };
+    let mut sent = Sent { published: 0, dropped: 0 };
     while sent.published + sent.dropped < most {
         let payload = match &mut lines {
             None => fixed.clone(),
@@ -179,8 +179,8 @@ async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, C
     Ok(sent)
 }
 
-/// The lines of standard input, without their ends. A thread reads them: one that waits for input that never comes must not
-/// hold up the end of the process.
+/// The lines of standard input, without their ends. A thread reads them: one that waits for input
+/// that never comes must not hold up the end of the process.
 fn lines_of_input() -> mpsc::Receiver<Result<Bytes, CliError>> {
     let (tell, told) = mpsc::channel(WAITING_LINES);
     std::thread::spawn(move || {
@@ -209,9 +209,7 @@ fn next_line(input: &mut impl BufRead) -> Result<Option<Bytes>, CliError> {
         line.pop();
     }
     if line.len() > MAX_LINE_BYTES {
-        return Err(CliError::Failed(
-            "a line of standard input is longer than 16 MiB".to_owned(),
-        ));
+        return Err(CliError::Failed("a line of standard input is longer than 16 MiB".to_owned()));
     }
     Ok(Some(Bytes::from(line)))
 }

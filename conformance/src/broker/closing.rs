@@ -2,11 +2,15 @@
 
 use super::Fixture;
 use super::tools::{
-    Outcome, Reader, channel, connected, eventually, numbered, open_publisher, publish, wait_for_health, within, writer,
+    Outcome, Reader, channel, connected, eventually, numbered, open_publisher, publish,
+    wait_for_health, within, writer,
 };
-use blaze_brokers::port::{BrokerError, Health, PublishOutcome, PublisherOptions, SubscribeOptions};
+use blaze_brokers::port::{
+    BrokerError, Health, PublishOutcome, PublisherOptions, SubscribeOptions,
+};
 
-/// Closing delivers what was taken, ends the client's own readers, and refuses what comes later; other clients go on.
+/// Closing delivers what was taken, ends the client's own readers, and refuses what comes later;
+/// other clients go on.
 ///
 /// # Errors
 /// How the adapter breaks the rule.
@@ -29,10 +33,7 @@ pub async fn close_delivers_and_ends(fixture: &dyn Fixture) -> Outcome {
             .next_frame("a message that was taken before the client was closed")
             .await
             .map_err(|error| {
-                format!(
-                    "message {sequence} of {MESSAGES}: {error}; later: {:?}",
-                    publisher.later()
-                )
+                format!("message {sequence} of {MESSAGES}: {error}; later: {:?}", publisher.later())
             })?
             .sequence();
         if found != sequence {
@@ -85,11 +86,7 @@ pub async fn close_leaves_nothing_behind(fixture: &dyn Fixture) -> Outcome {
         }
         drop(client);
         let how = if close_first { "closed" } else { "dropped" };
-        while reader
-            .next_or_end(&format!("the reader of a {how} client ends"))
-            .await?
-            .is_some()
-        {}
+        while reader.next_or_end(&format!("the reader of a {how} client ends")).await?.is_some() {}
         let outcome = publisher.publish(&numbered(&channel, writer(1), 2)?, None);
         if outcome != PublishOutcome::Dropped {
             return Err(format!("publishing on a {how} client was {outcome:?}"));

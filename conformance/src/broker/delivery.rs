@@ -9,22 +9,13 @@ use bytes::Bytes;
 
 use super::Fixture;
 use super::tools::{
-    DEADLINE, Outcome, Reader, channel, connected, describe, frame, numbered, open_publisher, open_publisher_with,
-    pattern, publish, writer,
+    DEADLINE, Outcome, Reader, channel, connected, describe, frame, numbered, open_publisher,
+    open_publisher_with, pattern, publish, writer,
 };
 use blaze_brokers::port::{Broker, Content, PublishOutcome, Publisher, PublisherOptions};
 
-const SIZES: &[usize] = &[
-    1,
-    2,
-    100,
-    1_023,
-    65_535,
-    65_536,
-    1_048_576,
-    8_000_000,
-    MAX_PAYLOAD_BYTES,
-];
+const SIZES: &[usize] =
+    &[1, 2, 100, 1_023, 65_535, 65_536, 1_048_576, 8_000_000, MAX_PAYLOAD_BYTES];
 
 /// Four writers on two clients publish at once: everyone's messages arrive completely and in order.
 ///
@@ -39,23 +30,21 @@ pub async fn order_per_writer(fixture: &dyn Fixture) -> Outcome {
     let mut threads = Vec::new();
     for number in 1..=WRITERS {
         // Best effort may lose some of so many at once.
-        let reliable = PublisherOptions {
-            reliable: true,
-            ..PublisherOptions::default()
-        };
-        let publisher = open_publisher_with(clients[usize::from(number) % 2].as_ref(), &channel, reliable)?;
+        let reliable = PublisherOptions { reliable: true, ..PublisherOptions::default() };
+        let publisher =
+            open_publisher_with(clients[usize::from(number) % 2].as_ref(), &channel, reliable)?;
         reader.meet(fixture, publisher.as_ref(), false).await?;
         let channel = channel.clone();
         threads.push(std::thread::spawn(move || {
-            (1..=MESSAGES)
-                .try_for_each(|sequence| publish(publisher.as_ref(), &numbered(&channel, writer(number), sequence)?))
+            (1..=MESSAGES).try_for_each(|sequence| {
+                publish(publisher.as_ref(), &numbered(&channel, writer(number), sequence)?)
+            })
         }));
     }
     let mut last: HashMap<WriterId, u64> = HashMap::new();
     for _ in 0..u64::from(WRITERS) * MESSAGES {
-        let frame = reader
-            .next_frame(&format!("2,000 messages of four writers, so far {last:?}"))
-            .await?;
+        let frame =
+            reader.next_frame(&format!("2,000 messages of four writers, so far {last:?}")).await?;
         let last = last.entry(frame.writer()).or_default();
         if frame.sequence() != *last + 1 {
             return Err(format!(
@@ -95,7 +84,8 @@ pub async fn own_publications_are_seen(fixture: &dyn Fixture) -> Outcome {
     }
 }
 
-/// Payloads of 1 B to 16 MiB, the most that a message may have, arrive with every byte and the whole header.
+/// Payloads of 1 B to 16 MiB, the most that a message may have, arrive with every byte and the
+/// whole header.
 ///
 /// # Errors
 /// How the adapter breaks the rule.
@@ -103,7 +93,8 @@ pub async fn framed_payloads_arrive_as_they_are(fixture: &dyn Fixture) -> Outcom
     let channel = channel("framed")?;
     let (mut reader, publisher, _clients) = apart(fixture, &channel, false).await?;
     for (sequence, size) in (1..).zip(sizes(fixture)) {
-        let sent = frame(&channel, writer(1), sequence, pattern(size, 1))?.with_hops_and_age(3, 4_567);
+        let sent =
+            frame(&channel, writer(1), sequence, pattern(size, 1))?.with_hops_and_age(3, 4_567);
         publish(publisher.as_ref(), &sent)?;
         let found = reader.next_frame(&format!("a frame with {size} bytes")).await?;
         if found.payload() != sent.payload() {
@@ -165,10 +156,10 @@ pub async fn bare_payloads_arrive_as_they_are(fixture: &dyn Fixture) -> Outcome 
 /// # Errors
 /// How the adapter breaks the rule.
 pub async fn reserved_channels_carry_json_as_it_is(fixture: &dyn Fixture) -> Outcome {
-    let json = Bytes::from_static(br#"{"op":"withdraw",  "topic":"imu/data","service":"imu-driver"}"#);
-    let reply: ChannelName = "blaze/reply/conformance-0"
-        .parse()
-        .map_err(|error| format!("{error}"))?;
+    let json =
+        Bytes::from_static(br#"{"op":"withdraw",  "topic":"imu/data","service":"imu-driver"}"#);
+    let reply: ChannelName =
+        "blaze/reply/conformance-0".parse().map_err(|error| format!("{error}"))?;
     for channel in [ChannelName::control(), ChannelName::events(), reply] {
         let (mut reader, publisher, _clients) = apart(fixture, &channel, true).await?;
         publish_bare(publisher.as_ref(), &json)?;
@@ -179,7 +170,8 @@ pub async fn reserved_channels_carry_json_as_it_is(fixture: &dyn Fixture) -> Out
     Ok(())
 }
 
-/// What begins with `BLZ1` and is no frame is reported as malformed, never as bare, and what follows still arrives.
+/// What begins with `BLZ1` and is no frame is reported as malformed, never as bare, and what
+/// follows still arrives.
 ///
 /// # Errors
 /// How the adapter breaks the rule.

@@ -4,9 +4,10 @@
 //! Fixture (one per adapter: clients, server away and back) ──► rules ──► Ok, or what is wrong
 //! ```
 //!
-//! An adapter writes a [`Fixture`] and one line, [`broker_conformance_tests!`](crate::broker_conformance_tests), which makes a test of
-//! each rule; or it calls [`run_all`] where starting a server for every rule takes too long. All waits are on conditions
-//! with a deadline, never on time alone.
+//! An adapter writes a [`Fixture`] and one line,
+//! [`broker_conformance_tests!`](crate::broker_conformance_tests), which makes a test of each rule;
+//! or it calls [`run_all`] where starting a server for every rule takes too long. All waits are on
+//! conditions with a deadline, never on time alone.
 
 mod closing;
 mod delivery;
@@ -25,14 +26,14 @@ use blaze_brokers::port::Broker;
 
 pub use closing::{close_delivers_and_ends, close_leaves_nothing_behind};
 pub use delivery::{
-    bare_payloads_arrive_as_they_are, framed_payloads_arrive_as_they_are, malformed_frames_are_reported,
-    many_channels_stay_apart, order_per_writer, own_publications_are_seen, reserved_channels_carry_json_as_it_is,
-    too_large_is_refused,
+    bare_payloads_arrive_as_they_are, framed_payloads_arrive_as_they_are,
+    malformed_frames_are_reported, many_channels_stay_apart, order_per_writer,
+    own_publications_are_seen, reserved_channels_carry_json_as_it_is, too_large_is_refused,
 };
 pub use outage::{publishing_never_waits, server_away_and_back};
 pub use subscriptions::{
-    dropping_a_subscription_unsubscribes, late_joiners_get_what_is_kept, slow_readers_are_bounded_in_bytes,
-    slow_readers_are_bounded_in_messages,
+    dropping_a_subscription_unsubscribes, late_joiners_get_what_is_kept,
+    slow_readers_are_bounded_in_bytes, slow_readers_are_bounded_in_messages,
 };
 
 /// What an adapter and its server can do; the rules ask for no more.
@@ -50,8 +51,8 @@ pub struct Capabilities {
     pub keeps_while_away: bool,
     /// A publisher finds its readers only some time after it was made (DDS).
     pub finds_readers_late: bool,
-    /// What was published so short a time before a subscription may count as published after it, because clocks of several hosts are
-    /// compared (DDS).
+    /// What was published so short a time before a subscription may count as published after it,
+    /// because clocks of several hosts are compared (DDS).
     pub clocks_apart: Duration,
     /// Most bytes of messages that one publisher's queue holds while the server is away.
     pub queue_bytes: usize,
@@ -62,7 +63,8 @@ pub struct Capabilities {
 }
 
 impl Default for Capabilities {
-    /// Everything but what is special to Kafka and DDS, 500 channels, payloads up to the largest, queues of 64 MiB.
+    /// Everything but what is special to Kafka and DDS, 500 channels, payloads up to the largest,
+    /// queues of 64 MiB.
     fn default() -> Self {
         Self {
             bare: true,
@@ -108,14 +110,15 @@ pub trait Fixture: Send + Sync {
         None
     }
 
-    /// What closed and dropped clients have left behind beside tasks of the current runtime (threads, sockets), for people;
-    /// empty = nothing.
+    /// What closed and dropped clients have left behind beside tasks of the current runtime
+    /// (threads, sockets), for people; empty = nothing.
     async fn leftovers(&self) -> Vec<String> {
         Vec::new()
     }
 }
 
-/// One list of rules for [`run_all`] and the tests of [`broker_conformance_tests!`](crate::broker_conformance_tests).
+/// One list of rules for [`run_all`] and the tests of
+/// [`broker_conformance_tests!`](crate::broker_conformance_tests).
 macro_rules! rules {
     ($d:tt $($rule:ident),+ $(,)?) => {
         /// Tries all rules, one after the other, on one fixture. Returns those that are broken.
@@ -129,8 +132,8 @@ macro_rules! rules {
             failures
         }
 
-        /// Makes a test of each rule. The argument is an expression whose `await` gives a [`Fixture`]; it is evaluated
-        /// once for each test.
+        /// Makes a test of each rule. The argument is an expression whose `await` gives a
+        /// [`Fixture`]; it is evaluated once for each test.
         #[macro_export]
         macro_rules! broker_conformance_tests {
             ($d fixture:expr) => {

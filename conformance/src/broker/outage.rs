@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 
 use super::Fixture;
 use super::tools::{
-    DEADLINE, Outcome, Reader, channel, connected, describe, eventually_within, frame, numbered, open_publisher,
-    publish, tracked, wait_for_health, within, writer,
+    DEADLINE, Outcome, Reader, channel, connected, describe, eventually_within, frame, numbered,
+    open_publisher, publish, tracked, wait_for_health, within, writer,
 };
 use blaze_brokers::port::{BrokerError, Content, Health, PublishOutcome, SubscribeOptions};
 
-/// The status goes down and up again; what is published meanwhile is dropped or delivered, never reordered nor delivered
-/// twice; afterwards the same subscription and publisher work as before.
+/// The status goes down and up again; what is published meanwhile is dropped or delivered, never
+/// reordered nor delivered twice; afterwards the same subscription and publisher work as before.
 ///
 /// # Errors
 /// How the adapter breaks the rule.
@@ -51,7 +51,9 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
         let dropped_before = publisher.later().dropped();
         for _ in 0..20 {
             sequence += 1;
-            if publisher.publish(&numbered(&channel, writer(1), sequence)?, None) == PublishOutcome::Taken {
+            if publisher.publish(&numbered(&channel, writer(1), sequence)?, None)
+                == PublishOutcome::Taken
+            {
                 taken_away.push(sequence);
             }
         }
@@ -59,7 +61,8 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
         for client in clients.iter().chain([&newcomer]) {
             wait_for_health(client.as_ref(), Health::Up).await?;
         }
-        // The adapter may subscribe again only a moment after it is up: until one arrives, publish on.
+        // The adapter may subscribe again only a moment after it is up: until one arrives, publish
+        // on.
         let last_away = sequence;
         let until = Instant::now() + DEADLINE;
         while last <= last_away {
@@ -75,9 +78,13 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
                 return Err("after the server came back, nothing was received any more".to_owned());
             }
         }
-        if capabilities.keeps_while_away && publisher.later().dropped() == dropped_before && !taken_away.is_empty() {
+        if capabilities.keeps_while_away
+            && publisher.later().dropped() == dropped_before
+            && !taken_away.is_empty()
+        {
             return Err(format!(
-                "taken while the server was away and not counted as dropped, but lost: {taken_away:?}"
+                "taken while the server was away and not counted as dropped, but lost: \
+                 {taken_away:?}"
             ));
         }
         taken_away.clear();

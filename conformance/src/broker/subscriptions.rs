@@ -6,36 +6,37 @@ use bytes::Bytes;
 
 use super::Fixture;
 use super::tools::{
-    Outcome, Reader, channel, connected, describe, eventually, frame, numbered, numbered_to_keep, open_publisher,
-    open_publisher_with, publish, writer,
+    Outcome, Reader, channel, connected, describe, eventually, frame, numbered, numbered_to_keep,
+    open_publisher, open_publisher_with, publish, writer,
 };
 use blaze_brokers::port::{Broker, Content, PublisherOptions, SubscribeOptions};
 
-/// A reader that does not read holds no more messages than it asked for; the newest stay, the others are counted.
+/// A reader that does not read holds no more messages than it asked for; the newest stay, the
+/// others are counted.
 ///
 /// # Errors
 /// How the adapter breaks the rule.
 pub async fn slow_readers_are_bounded_in_messages(fixture: &dyn Fixture) -> Outcome {
-    let options = SubscribeOptions {
-        max_messages: 100,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { max_messages: 100, ..SubscribeOptions::default() };
     slow_reader(fixture, options, 10, 100).await
 }
 
-/// A reader that does not read holds no more bytes than it asked for; the newest stay, the others are counted.
+/// A reader that does not read holds no more bytes than it asked for; the newest stay, the others
+/// are counted.
 ///
 /// # Errors
 /// How the adapter breaks the rule.
 pub async fn slow_readers_are_bounded_in_bytes(fixture: &dyn Fixture) -> Outcome {
-    let options = SubscribeOptions {
-        max_bytes: 100_000,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { max_bytes: 100_000, ..SubscribeOptions::default() };
     slow_reader(fixture, options, 10_000, 10).await
 }
 
-async fn slow_reader(fixture: &dyn Fixture, options: SubscribeOptions, size: usize, most: u64) -> Outcome {
+async fn slow_reader(
+    fixture: &dyn Fixture,
+    options: SubscribeOptions,
+    size: usize,
+    most: u64,
+) -> Outcome {
     const MESSAGES: u64 = 1_000;
     let channel = channel("slow")?;
     let client = connected(fixture).await?;
@@ -47,10 +48,7 @@ async fn slow_reader(fixture: &dyn Fixture, options: SubscribeOptions, size: usi
     slow.skip_probes(fixture).await;
     let payload = Bytes::from(vec![b'x'; size]);
     for sequence in 1..=MESSAGES {
-        publish(
-            publisher.as_ref(),
-            &frame(&channel, writer(1), sequence, payload.clone())?,
-        )?;
+        publish(publisher.as_ref(), &frame(&channel, writer(1), sequence, payload.clone())?)?;
         // The witness keeps pace, so that it is the slow reader alone that loses.
         if sequence % 50 == 0 {
             while witness
@@ -69,11 +67,7 @@ async fn slow_reader(fixture: &dyn Fixture, options: SubscribeOptions, size: usi
     .await?;
     let mut found = Vec::new();
     while found.last() != Some(&MESSAGES) {
-        found.push(
-            slow.next_frame("the newest message for a slow reader")
-                .await?
-                .sequence(),
-        );
+        found.push(slow.next_frame("the newest message for a slow reader").await?.sequence());
         dropped += slow.take_dropped();
     }
     let count = found.len() as u64;
@@ -81,9 +75,7 @@ async fn slow_reader(fixture: &dyn Fixture, options: SubscribeOptions, size: usi
         return Err(format!("{count} messages waited, at most {most} were allowed"));
     }
     if count + dropped != MESSAGES {
-        return Err(format!(
-            "{count} received and {dropped} counted as dropped, of {MESSAGES}"
-        ));
+        return Err(format!("{count} received and {dropped} counted as dropped, of {MESSAGES}"));
     }
     let newest: Vec<u64> = (MESSAGES - count + 1..=MESSAGES).collect();
     if found != newest {
@@ -92,7 +84,8 @@ async fn slow_reader(fixture: &dyn Fixture, options: SubscribeOptions, size: usi
     Ok(())
 }
 
-/// A dropped subscription is one less at the server, and frees its messages; the channel can be read again.
+/// A dropped subscription is one less at the server, and frees its messages; the channel can be
+/// read again.
 ///
 /// # Errors
 /// How the adapter breaks the rule.
@@ -115,7 +108,8 @@ pub async fn dropping_a_subscription_unsubscribes(fixture: &dyn Fixture) -> Outc
                 .sequence();
             if found != expected {
                 return Err(format!(
-                    "message {expected} was expected after the other reader left, but it was {found}"
+                    "message {expected} was expected after the other reader left, but it was \
+                     {found}"
                 ));
             }
         }
@@ -125,7 +119,10 @@ pub async fn dropping_a_subscription_unsubscribes(fixture: &dyn Fixture) -> Outc
     Ok(())
 }
 
-async fn wait_for_no_reader(fixture: &dyn Fixture, channel: &blaze_domain::names::ChannelName) -> Outcome {
+async fn wait_for_no_reader(
+    fixture: &dyn Fixture,
+    channel: &blaze_domain::names::ChannelName,
+) -> Outcome {
     let until = std::time::Instant::now() + super::tools::DEADLINE;
     while let Some(readers) = fixture.readers_of(channel).await {
         if readers == 0 {
@@ -133,7 +130,8 @@ async fn wait_for_no_reader(fixture: &dyn Fixture, channel: &blaze_domain::names
         }
         if std::time::Instant::now() > until {
             return Err(format!(
-                "the server still has {readers} readers of {channel}, though all subscriptions were dropped"
+                "the server still has {readers} readers of {channel}, though all subscriptions \
+                 were dropped"
             ));
         }
         tokio::time::sleep(std::time::Duration::from_millis(10)).await;
@@ -141,8 +139,9 @@ async fn wait_for_no_reader(fixture: &dyn Fixture, channel: &blaze_domain::names
     Ok(())
 }
 
-/// A late joiner that asks for it begins with the last `depth` of every writer, in order, and goes on with what is
-/// published next; one that does not ask begins with the latter. A kept message may also come once more as a live one.
+/// A late joiner that asks for it begins with the last `depth` of every writer, in order, and goes
+/// on with what is published next; one that does not ask begins with the latter. A kept message may
+/// also come once more as a live one.
 ///
 /// # Errors
 /// How the adapter breaks the rule.
@@ -153,11 +152,7 @@ pub async fn late_joiners_get_what_is_kept(fixture: &dyn Fixture) -> Outcome {
     let channel = channel("kept")?;
     let clients = [connected(fixture).await?, connected(fixture).await?];
     let mut witness = Reader::open(clients[1].as_ref(), &channel).await?;
-    let options = PublisherOptions {
-        depth: 3,
-        reliable: true,
-        large: false,
-    };
+    let options = PublisherOptions { depth: 3, reliable: true, large: false };
     let publishers = [
         open_publisher_with(clients[0].as_ref(), &channel, options)?,
         open_publisher_with(clients[0].as_ref(), &channel, options)?,
@@ -175,16 +170,9 @@ pub async fn late_joiners_get_what_is_kept(fixture: &dyn Fixture) -> Outcome {
     // Time itself is what tells the one from the other here.
     tokio::time::sleep(fixture.capabilities().clocks_apart).await;
     // Fewer than are kept: they raise the bound, but for probes there must be room.
-    let max_messages = if fixture.capabilities().finds_readers_late {
-        4096
-    } else {
-        2
-    };
-    let with_kept = SubscribeOptions {
-        with_kept: true,
-        max_messages,
-        ..SubscribeOptions::default()
-    };
+    let max_messages = if fixture.capabilities().finds_readers_late { 4096 } else { 2 };
+    let with_kept =
+        SubscribeOptions { with_kept: true, max_messages, ..SubscribeOptions::default() };
     let late_client: Arc<dyn Broker> = connected(fixture).await?;
     let mut late = Reader::open_with(late_client.as_ref(), &channel, with_kept).await?;
     let mut plain = Reader::open(late_client.as_ref(), &channel).await?;

@@ -12,13 +12,15 @@ use bytes::Bytes;
 
 use super::Fixture;
 use blaze_brokers::port::{
-    Broker, Content, Health, PublishOutcome, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
+    Broker, Content, Health, PublishOutcome, Publisher, PublisherOptions, Received,
+    SubscribeOptions, Subscription,
 };
 
 /// What a rule gives: nothing, or what is wrong.
 pub(super) type Outcome<T = ()> = Result<T, String>;
 
-/// How long a condition may take to come true; generous, because it is only spent where a rule is broken.
+/// How long a condition may take to come true; generous, because it is only spent where a rule is
+/// broken.
 pub(super) const DEADLINE: Duration = Duration::from_secs(20);
 /// How long silence must last to count as silence.
 pub(super) const SILENCE: Duration = Duration::from_millis(300);
@@ -29,11 +31,7 @@ const PROBE_JSON: &[u8] = br#"{"conformance":"probe"}"#;
 /// A channel that no other test uses.
 pub(super) fn channel(base: &str) -> Outcome<ChannelName> {
     static COUNT: AtomicU64 = AtomicU64::new(0);
-    let text = format!(
-        "{base}/{}-{}",
-        std::process::id(),
-        COUNT.fetch_add(1, Ordering::Relaxed)
-    );
+    let text = format!("{base}/{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
     text.parse().map_err(|error| format!("channel name {text:?}: {error}"))
 }
 
@@ -43,12 +41,23 @@ pub(super) fn writer(number: u8) -> WriterId {
 }
 
 /// A frame with all that must survive.
-pub(super) fn frame(channel: &ChannelName, writer: WriterId, sequence: u64, payload: Bytes) -> Outcome<Frame> {
+pub(super) fn frame(
+    channel: &ChannelName,
+    writer: WriterId,
+    sequence: u64,
+    payload: Bytes,
+) -> Outcome<Frame> {
     frame_to_keep(channel, writer, sequence, payload, 0)
 }
 
 /// A frame of a writer that keeps the last `depth`.
-fn frame_to_keep(channel: &ChannelName, writer: WriterId, sequence: u64, payload: Bytes, depth: u32) -> Outcome<Frame> {
+fn frame_to_keep(
+    channel: &ChannelName,
+    writer: WriterId,
+    sequence: u64,
+    payload: Bytes,
+    depth: u32,
+) -> Outcome<Frame> {
     let origin = Origin {
         layer: "edge".to_owned(),
         node: "robot-1".to_owned(),
@@ -70,7 +79,12 @@ pub(super) fn numbered(channel: &ChannelName, writer: WriterId, sequence: u64) -
 }
 
 /// As [`numbered`], of a writer that keeps the last `depth`.
-pub(super) fn numbered_to_keep(channel: &ChannelName, writer: WriterId, sequence: u64, depth: u32) -> Outcome<Frame> {
+pub(super) fn numbered_to_keep(
+    channel: &ChannelName,
+    writer: WriterId,
+    sequence: u64,
+    depth: u32,
+) -> Outcome<Frame> {
     frame_to_keep(channel, writer, sequence, Bytes::from(sequence.to_string()), depth)
 }
 
@@ -96,7 +110,11 @@ pub(super) async fn eventually(what: &str, holds: impl FnMut() -> bool) -> Outco
 }
 
 /// As [`eventually`], within a time.
-pub(super) async fn eventually_within(time: Duration, what: &str, mut holds: impl FnMut() -> bool) -> Outcome {
+pub(super) async fn eventually_within(
+    time: Duration,
+    what: &str,
+    mut holds: impl FnMut() -> bool,
+) -> Outcome {
     let until = Instant::now() + time;
     while !holds() {
         if Instant::now() > until {
@@ -125,13 +143,14 @@ pub(super) async fn connected(fixture: &dyn Fixture) -> Outcome<Arc<dyn Broker>>
 pub(super) async fn wait_for_health(broker: &dyn Broker, health: Health) -> Outcome {
     let mut status = broker.status();
     let what = format!("the status of the {} broker becomes {health:?}", broker.kind());
-    let seen = within(&what, status.wait_for(|status| status.health == health))
-        .await?
-        .map(|_| ());
+    let seen = within(&what, status.wait_for(|status| status.health == health)).await?.map(|_| ());
     seen.map_err(|_| format!("{what}: the adapter dropped its status before"))
 }
 
-pub(super) fn open_publisher(broker: &dyn Broker, channel: &ChannelName) -> Outcome<Arc<dyn Publisher>> {
+pub(super) fn open_publisher(
+    broker: &dyn Broker,
+    channel: &ChannelName,
+) -> Outcome<Arc<dyn Publisher>> {
     open_publisher_with(broker, channel, PublisherOptions::default())
 }
 
@@ -177,14 +196,16 @@ impl Reader {
         let subscription = within(&what, broker.subscribe(channel, options))
             .await?
             .map_err(|error| format!("{what}: {error}"))?;
-        Ok(Self {
-            subscription,
-            waiting: VecDeque::new(),
-        })
+        Ok(Self { subscription, waiting: VecDeque::new() })
     }
 
     /// Makes sure that a publisher has found this reader, where that takes time.
-    pub(super) async fn meet(&mut self, fixture: &dyn Fixture, publisher: &dyn Publisher, bare: bool) -> Outcome {
+    pub(super) async fn meet(
+        &mut self,
+        fixture: &dyn Fixture,
+        publisher: &dyn Publisher,
+        bare: bool,
+    ) -> Outcome {
         if !fixture.capabilities().finds_readers_late {
             return Ok(());
         }
@@ -220,12 +241,12 @@ impl Reader {
                 .await
                 .is_ok_and(|count| count > 0)
         {
-            self.waiting
-                .extend(batch.drain(..).filter(|message| !is_probe(message)));
+            self.waiting.extend(batch.drain(..).filter(|message| !is_probe(message)));
         }
     }
 
-    /// Takes the probes that are still under way: up to the last one, or until there is silence where they have no number.
+    /// Takes the probes that are still under way: up to the last one, or until there is silence
+    /// where they have no number.
     async fn meet_last(&mut self, mut batch: Vec<Received>, last: u64) -> Outcome {
         loop {
             let is_last = |message: &Received| match &message.content {
@@ -233,8 +254,7 @@ impl Reader {
                 Content::Bare { .. } | Content::Malformed { .. } => false,
             };
             let ends = batch.iter().any(is_last);
-            self.waiting
-                .extend(batch.drain(..).filter(|message| !is_probe(message)));
+            self.waiting.extend(batch.drain(..).filter(|message| !is_probe(message)));
             let more = self.subscription.receive(&mut batch, 64);
             if ends || tokio::time::timeout(SILENCE, more).await.is_err() {
                 return Ok(());
@@ -252,16 +272,13 @@ impl Reader {
             if within(what, self.subscription.receive(&mut batch, 64)).await? == 0 {
                 return Ok(None);
             }
-            self.waiting
-                .extend(batch.into_iter().filter(|message| !is_probe(message)));
+            self.waiting.extend(batch.into_iter().filter(|message| !is_probe(message)));
         }
     }
 
     /// The next message.
     pub(super) async fn next(&mut self, what: &str) -> Outcome<Received> {
-        self.next_or_end(what)
-            .await?
-            .ok_or_else(|| format!("{what}: the subscription ended"))
+        self.next_or_end(what).await?.ok_or_else(|| format!("{what}: the subscription ended"))
     }
 
     /// The next message, which must be a frame.
@@ -276,10 +293,9 @@ impl Reader {
     pub(super) async fn next_bare(&mut self, what: &str) -> Outcome<Bytes> {
         match self.next(what).await?.content {
             Content::Bare { payload, .. } => Ok(payload),
-            other => Err(format!(
-                "{what}: a bare payload was expected, but it was {}",
-                describe(&other)
-            )),
+            other => {
+                Err(format!("{what}: a bare payload was expected, but it was {}", describe(&other)))
+            }
         }
     }
 
@@ -288,8 +304,7 @@ impl Reader {
         if self.waiting.is_empty() {
             let mut batch = Vec::new();
             let _ = tokio::time::timeout(SILENCE, self.subscription.receive(&mut batch, 64)).await;
-            self.waiting
-                .extend(batch.into_iter().filter(|message| !is_probe(message)));
+            self.waiting.extend(batch.into_iter().filter(|message| !is_probe(message)));
         }
         Ok(self.waiting.pop_front())
     }

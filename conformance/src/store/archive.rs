@@ -8,13 +8,12 @@ use super::tools::{Model, commit, fresh};
 use blaze_config::store::upkeep::now;
 use blaze_config::store::{AuditEntry, AuditQuery, FullStore, Op, TokenRecord};
 
-/// The history of a document is read newest first, in pages, also after its deletion, and never holds another one's.
+/// The history of a document is read newest first, in pages, also after its deletion, and never
+/// holds another one's.
 pub async fn versions_come_newest_first(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "versions").await;
     // Names that begin alike must not be mixed up.
-    model
-        .write(&[&["a", "a-b", "ab"], &["a"], &["-a", "ab"], &["a"], &["a-b"]])
-        .await;
+    model.write(&[&["a", "a-b", "ab"], &["a"], &["-a", "ab"], &["a"], &["a-b"]]).await;
     let key = samples::key("a");
     let all = model.store.versions(&key, None, 10).await.unwrap();
     let seen: Vec<(u64, Op, Option<u64>)> = all
@@ -37,22 +36,17 @@ pub async fn versions_come_newest_first(fixture: &dyn Fixture) {
     }
     let page = model.store.versions(&key, Some(4), 2).await.unwrap();
     assert_eq!(page.as_slice(), &all[1..3], "a page below 4");
-    assert_eq!(
-        model.store.versions(&key, Some(1), 9).await.unwrap().len(),
-        0,
-        "below 1"
-    );
+    assert_eq!(model.store.versions(&key, Some(1), 9).await.unwrap().len(), 0, "below 1");
     let unknown = model.store.versions(&samples::key("z"), None, 9).await.unwrap();
     assert_eq!(unknown.len(), 0, "versions of an unknown document");
-    // The page begins in the middle of commits that were written together, with later changes of the same document.
+    // The page begins in the middle of commits that were written together, with later changes of
+    // the same document.
     model.write(&[&["b"]]).await;
     model.write(&[&["ab"], &["b"], &["b"], &["ab"]]).await;
-    for (below, limit, expected) in [(8, 1, vec![6]), (9, 1, vec![8]), (9, 2, vec![8, 6]), (8, 9, vec![6])] {
-        let page = model
-            .store
-            .versions(&samples::key("b"), Some(below), limit)
-            .await
-            .unwrap();
+    for (below, limit, expected) in
+        [(8, 1, vec![6]), (9, 1, vec![8]), (9, 2, vec![8, 6]), (8, 9, vec![6])]
+    {
+        let page = model.store.versions(&samples::key("b"), Some(below), limit).await.unwrap();
         let page: Vec<u64> = page.iter().map(|version| version.revision).collect();
         assert_eq!(page, expected, "{limit} below {below}");
     }
@@ -61,22 +55,13 @@ pub async fn versions_come_newest_first(fixture: &dyn Fixture) {
 /// The newest revision before a time is found.
 pub async fn revisions_before_a_time_are_found(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "before").await;
-    assert_eq!(
-        model.store.revision_before(now()).await.unwrap(),
-        0,
-        "in an empty store"
-    );
+    assert_eq!(model.store.revision_before(now()).await.unwrap(), 0, "in an empty store");
     for _ in 0..9 {
         model.write(&[&["a"]]).await;
     }
-    for (before, expected) in [
-        (time(0), 0),
-        (time(1), 0),
-        (time(2), 1),
-        (time(9), 8),
-        (time(10), 9),
-        (time(99), 9),
-    ] {
+    for (before, expected) in
+        [(time(0), 0), (time(1), 0), (time(2), 1), (time(9), 8), (time(10), 9), (time(99), 9)]
+    {
         let found = model.store.revision_before(before).await.unwrap();
         assert_eq!(found, expected, "the revision before {before}");
     }
@@ -90,28 +75,22 @@ pub async fn revisions_before_a_time_are_found(fixture: &dyn Fixture) {
 /// What a query asks for.
 type Holds = fn(&AuditEntry) -> bool;
 
-/// Each filter of the audit holds, entries come newest first, and pages neither overlap nor leave one out.
+/// Each filter of the audit holds, entries come newest first, and pages neither overlap nor leave
+/// one out.
 pub async fn audit_is_filtered_and_paged(fixture: &dyn Fixture) {
     let store = fresh(fixture, "audit").await;
     let mut entries: Vec<AuditEntry> = (0..20).map(entry).collect();
     store.append_audit(&entries).await.unwrap();
     entries.reverse();
     let asked = |set: fn(&mut AuditQuery)| {
-        let mut query = AuditQuery {
-            limit: 100,
-            ..AuditQuery::default()
-        };
+        let mut query = AuditQuery { limit: 100, ..AuditQuery::default() };
         set(&mut query);
         query
     };
     let queries: [(AuditQuery, Holds); 7] = [
         (asked(|_| ()), |_| true),
-        (asked(|query| query.subject = Some("eve".to_owned())), |entry| {
-            entry.subject == "eve"
-        }),
-        (asked(|query| query.action = Some("reveal".to_owned())), |entry| {
-            entry.action == "reveal"
-        }),
+        (asked(|query| query.subject = Some("eve".to_owned())), |entry| entry.subject == "eve"),
+        (asked(|query| query.action = Some("reveal".to_owned())), |entry| entry.action == "reveal"),
         (asked(|query| query.allowed = Some(false)), |entry| !entry.allowed),
         (asked(|query| query.kind = Some("Node".to_owned())), |entry| {
             entry.key.as_ref().is_some_and(|key| key.kind().as_str() == "Node")
@@ -126,7 +105,8 @@ pub async fn audit_is_filtered_and_paged(fixture: &dyn Fixture) {
     ];
     for (query, holds) in queries {
         let found = store.audit(&query).await.unwrap();
-        let expected: Vec<AuditEntry> = entries.iter().filter(|entry| holds(entry)).cloned().collect();
+        let expected: Vec<AuditEntry> =
+            entries.iter().filter(|entry| holds(entry)).cloned().collect();
         assert_eq!(found, expected, "{query:?}");
     }
     assert_eq!(pages(store.as_ref(), 3).await, entries, "all pages");
@@ -170,15 +150,12 @@ pub async fn audit_written_twice_is_there_once(fixture: &dyn Fixture) {
     store.append_audit(&entries[..2]).await.unwrap();
     store.append_audit(&entries).await.unwrap();
     store.append_audit(&[]).await.unwrap();
-    let query = AuditQuery {
-        limit: 10,
-        ..AuditQuery::default()
-    };
+    let query = AuditQuery { limit: 10, ..AuditQuery::default() };
     assert_eq!(store.audit(&query).await.unwrap().len(), 3, "entries");
 }
 
-/// Entries of commits and others are one audit, newest first by their ids, also where ids do not follow revisions, and
-/// whatever of it is trimmed.
+/// Entries of commits and others are one audit, newest first by their ids, also where ids do not
+/// follow revisions, and whatever of it is trimmed.
 pub async fn audit_of_commits_is_among_the_rest(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "merged").await;
     let mut all = Vec::new();
@@ -242,16 +219,13 @@ pub async fn answers_are_kept_until_they_expire(fixture: &dyn Fixture) {
     written.idempotency = Some(kept.clone());
     commit(store.as_ref(), &[written]).await;
     let before = Timestamp::from_millis(expires.as_millis() - 1);
-    assert_eq!(
-        store.idempotency("one", before).await.unwrap(),
-        Some(kept),
-        "just before"
-    );
+    assert_eq!(store.idempotency("one", before).await.unwrap(), Some(kept), "just before");
     assert_eq!(store.idempotency("one", expires).await.unwrap(), None, "at its end");
     assert_eq!(store.idempotency("two", before).await.unwrap(), None, "another id");
 }
 
-/// Tokens are listed newest first until they expire; the first revocation stays; each has its audit entry.
+/// Tokens are listed newest first until they expire; the first revocation stays; each has its audit
+/// entry.
 pub async fn tokens_are_kept_and_revoked(fixture: &dyn Fixture) {
     let store = fresh(fixture, "tokens").await;
     let start = now().as_millis();
@@ -272,33 +246,20 @@ pub async fn tokens_are_kept_and_revoked(fixture: &dyn Fixture) {
     assert_eq!(store.tokens(now()).await.unwrap(), expected, "the tokens");
     let times = [start + 500, start + 900].map(Timestamp::from_millis);
     for time in times {
-        let found = store
-            .revoke_token("two", time, &audit("token_revoke", None))
-            .await
-            .unwrap();
+        let found = store.revoke_token("two", time, &audit("token_revoke", None)).await.unwrap();
         assert!(found, "that there is a token of that id");
     }
     for token in &mut expected {
         token.revoke_time = (token.id == "two").then_some(Timestamp::from_millis(start + 500));
     }
     assert_eq!(store.tokens(now()).await.unwrap(), expected, "the tokens");
-    let found = store
-        .revoke_token("four", now(), &audit("token_revoke", None))
-        .await
-        .unwrap();
+    let found = store.revoke_token("four", now(), &audit("token_revoke", None)).await.unwrap();
     assert!(!found, "that there is a token that was never made");
     let later = Timestamp::from_millis(start + 3_600_000 * 2);
-    assert_eq!(
-        store.tokens(later).await.unwrap().len(),
-        0,
-        "tokens when all have expired"
-    );
+    assert_eq!(store.tokens(later).await.unwrap().len(), 0, "tokens when all have expired");
     for (action, count) in [("token_create", 3), ("token_revoke", 2)] {
-        let query = AuditQuery {
-            action: Some(action.to_owned()),
-            limit: 10,
-            ..AuditQuery::default()
-        };
+        let query =
+            AuditQuery { action: Some(action.to_owned()), limit: 10, ..AuditQuery::default() };
         assert_eq!(store.audit(&query).await.unwrap().len(), count, "entries of {action}");
     }
 }

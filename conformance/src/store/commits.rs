@@ -20,7 +20,8 @@ pub async fn an_empty_store_is_at_zero(fixture: &dyn Fixture) {
     assert_ne!(snapshot.store_id, other.store_id, "two stores");
 }
 
-/// Documents, commits, audit and answers are read as they were written, whatever keys and numbers they hold.
+/// Documents, commits, audit and answers are read as they were written, whatever keys and numbers
+/// they hold.
 pub async fn what_was_written_is_read_back(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "read-back").await;
     model.write(&[&["a", "b"]]).await;
@@ -33,10 +34,7 @@ pub async fn what_was_written_is_read_back(fixture: &dyn Fixture) {
     assert_eq!(log(model.store.as_ref(), 0).await, model.commits, "the log");
     let kept = model.store.idempotency("repeat", now()).await.unwrap();
     assert_eq!(kept, last.idempotency, "the answer to repeat");
-    let query = AuditQuery {
-        limit: 100,
-        ..AuditQuery::default()
-    };
+    let query = AuditQuery { limit: 100, ..AuditQuery::default() };
     let mut audit = model.store.audit(&query).await.unwrap();
     audit.retain(|entry| entry.revision == Some(3));
     audit.sort_by(|one, other| one.id.cmp(&other.id));
@@ -44,13 +42,12 @@ pub async fn what_was_written_is_read_back(fixture: &dyn Fixture) {
     assert_eq!(audit, last.audit, "the audit of commit 3");
 }
 
-/// A group is one transaction: all of its commits are there, and a fault in one of them keeps out all.
+/// A group is one transaction: all of its commits are there, and a fault in one of them keeps out
+/// all.
 pub async fn a_group_is_written_whole(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "group").await;
     // Within a group a document may be made, changed and deleted several times.
-    model
-        .write(&[&["a", "b"], &["a"], &["-a"], &["a", "c"], &["-c"], &["b", "-a"]])
-        .await;
+    model.write(&[&["a", "b"], &["a"], &["-a"], &["a", "c"], &["-c"], &["b", "-a"]]).await;
     model.check_now().await;
     assert_eq!(log(model.store.as_ref(), 0).await, model.commits, "the log");
     let many: Vec<String> = (0..256).map(|number| format!("n{number}")).collect();
@@ -71,10 +68,7 @@ pub async fn a_group_is_written_whole(fixture: &dyn Fixture) {
     assert_eq!(kept, None, "the answer of a group that was not written");
     let none = commit_of(revision, Vec::new());
     let refused = model.store.commit(&[record(none)]).await;
-    assert!(
-        matches!(refused, Err(CommitError::NotWritten(_))),
-        "without changes: {refused:?}"
-    );
+    assert!(matches!(refused, Err(CommitError::NotWritten(_))), "without changes: {refused:?}");
     model.check_now().await;
 }
 
@@ -83,22 +77,14 @@ pub async fn a_taken_revision_is_a_conflict(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "taken").await;
     model.write(&[&["a"], &["a"], &["b"]]).await;
     for revision in 1..=3 {
-        let mut late = record(commit_of(
-            revision,
-            vec![samples::change(Op::Create, "late", revision, None)],
-        ));
+        let mut late =
+            record(commit_of(revision, vec![samples::change(Op::Create, "late", revision, None)]));
         late.idempotency = Some(answer("late", revision));
-        conflict(
-            &format!("revision {revision} again"),
-            &model.store.commit(&[late]).await,
-        );
+        conflict(&format!("revision {revision} again"), &model.store.commit(&[late]).await);
     }
     model.check_now().await;
     assert_eq!(log(model.store.as_ref(), 0).await, model.commits, "the log");
-    let query = AuditQuery {
-        limit: 100,
-        ..AuditQuery::default()
-    };
+    let query = AuditQuery { limit: 100, ..AuditQuery::default() };
     assert_eq!(model.store.audit(&query).await.unwrap().len(), 3, "audit entries");
     assert_eq!(
         model.store.idempotency("late", now()).await.unwrap(),
@@ -135,7 +121,8 @@ pub async fn a_taken_answer_is_a_conflict(fixture: &dyn Fixture) {
     model.check_now().await;
 }
 
-/// The log is read in parts of any size, each in order and without a hole, and large commits come alone.
+/// The log is read in parts of any size, each in order and without a hole, and large commits come
+/// alone.
 pub async fn commits_come_in_order_and_in_parts(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "parts").await;
     for _ in 0..10 {
@@ -162,8 +149,11 @@ pub async fn commits_come_in_order_and_in_parts(fixture: &dyn Fixture) {
     let store = fresh(fixture, "large").await;
     for revision in 1..=40 {
         let mut large = samples::node("large", revision);
-        large.spec = std::sync::Arc::new(serde_json::json!({ "config": { "text": "x".repeat(250 * 1024) } }));
-        let mut change = samples::change(Op::Update, "large", revision, (revision > 1).then(|| revision - 1));
+        large.spec = std::sync::Arc::new(
+            serde_json::json!({ "config": { "text": "x".repeat(250 * 1024) } }),
+        );
+        let mut change =
+            samples::change(Op::Update, "large", revision, (revision > 1).then(|| revision - 1));
         change.document = std::sync::Arc::new(large);
         commit(store.as_ref(), &[record(commit_of(revision, vec![change]))]).await;
     }
@@ -173,8 +163,8 @@ pub async fn commits_come_in_order_and_in_parts(fixture: &dyn Fixture) {
     assert_eq!(log(store.as_ref(), 0).await.len(), 40, "{count} in the first part");
 }
 
-/// A commit may be larger than a database likes: it is whole all the same, alone and among others, in the log, in history
-/// and after trimming.
+/// A commit may be larger than a database likes: it is whole all the same, alone and among others,
+/// in the log, in history and after trimming.
 pub async fn commits_are_whole_whatever_their_size(fixture: &dyn Fixture) {
     let store = fresh(fixture, "huge").await;
     let mut commits = Vec::new();
@@ -211,11 +201,7 @@ pub async fn commits_are_whole_whatever_their_size(fixture: &dyn Fixture) {
         let old = before.iter().filter_map(|(_, document)| document.as_ref());
         let revisions: Vec<u64> = old.map(|document| document.revision).collect();
         assert_eq!(revisions.len(), 30, "documents that were there at 2");
-        assert_eq!(
-            revisions.iter().filter(|revision| **revision == 2).count(),
-            1,
-            "the one of 2"
-        );
+        assert_eq!(revisions.iter().filter(|revision| **revision == 2).count(), 1, "the one of 2");
         store.tidy().await.unwrap();
     }
     assert_eq!(store.trim(3, 1).await.unwrap(), 3, "the floor");
@@ -236,7 +222,8 @@ fn large_change(number: u32, revision: u64) -> blaze_config::store::Change {
     let name = format!("n{number}");
     let mut large = samples::node(&name, revision);
     let text = ["", "a", "b", "c", "d"][usize::try_from(revision % 5).unwrap_or(0)];
-    large.spec = std::sync::Arc::new(serde_json::json!({ "config": { "text": text.repeat(250 * 1024) } }));
+    large.spec =
+        std::sync::Arc::new(serde_json::json!({ "config": { "text": text.repeat(250 * 1024) } }));
     let before = match (revision, number) {
         (1, _) => None,
         (3, 0) => Some(2),

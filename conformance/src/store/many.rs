@@ -40,8 +40,8 @@ impl Model {
     }
 }
 
-/// Two that write as fast as they can: each revision is one's or the other's, none is missing, and what was acknowledged
-/// is there.
+/// Two that write as fast as they can: each revision is one's or the other's, none is missing, and
+/// what was acknowledged is there.
 pub async fn one_of_two_writers_has_each_revision(fixture: &dyn Fixture) {
     if !fixture.is_shared() {
         return;
@@ -51,7 +51,8 @@ pub async fn one_of_two_writers_has_each_revision(fixture: &dyn Fixture) {
     for store in &stores {
         assert!(store.is_shared());
     }
-    let (one, other) = tokio::join!(write_many(&stores[0], "one", 60), write_many(&stores[1], "other", 60));
+    let (one, other) =
+        tokio::join!(write_many(&stores[0], "one", 60), write_many(&stores[1], "other", 60));
     let commits = log(stores[0].as_ref(), 0).await;
     assert_eq!(commits.len(), 120, "how many commits there are");
     let found: BTreeSet<String> = commits.iter().map(|commit| commit.request_id.clone()).collect();
@@ -78,11 +79,7 @@ async fn write_many(store: &Arc<dyn FullStore>, name: &str, count: u64) -> BTree
     let mut written = 0;
     while written < count {
         let head = store.head().await.unwrap();
-        let size = if written.is_multiple_of(3) {
-            1
-        } else {
-            3.min(count - written)
-        };
+        let size = if written.is_multiple_of(3) { 1 } else { 3.min(count - written) };
         let group: Vec<_> = (1..=size)
             .map(|step| {
                 let revision = head + step;
@@ -134,8 +131,8 @@ pub async fn a_foreign_commit_is_noticed(fixture: &dyn Fixture) {
     }
 }
 
-/// A reader that follows the log while it is written and trimmed gets each commit once, in order, or is told that he is
-/// below the floor.
+/// A reader that follows the log while it is written and trimmed gets each commit once, in order,
+/// or is told that he is below the floor.
 pub async fn readers_never_see_a_hole_while_history_is_trimmed(fixture: &dyn Fixture) {
     const COMMITS: u64 = 150;
     let mut model = Model::new(fixture, "holes").await;
@@ -180,8 +177,8 @@ pub async fn readers_never_see_a_hole_while_history_is_trimmed(fixture: &dyn Fix
     model.check_now().await;
 }
 
-/// Several that tidy, some of which are cut off in the middle of it, and one that trims: what is loaded is right after each
-/// commit.
+/// Several that tidy, some of which are cut off in the middle of it, and one that trims: what is
+/// loaded is right after each commit.
 pub async fn documents_are_right_whoever_tidies(fixture: &dyn Fixture) {
     const DOCUMENTS: u64 = 400;
     let rounds = if crate::full() { 40 } else { 10 };
@@ -195,19 +192,20 @@ pub async fn documents_are_right_whoever_tidies(fixture: &dyn Fixture) {
     let writer = Arc::clone(&model.store);
     let stores: Vec<_> = others.iter().chain([&writer]).collect();
     let over = AtomicBool::new(false);
-    let tidying = futures::future::join_all(stores.iter().zip((1..).step_by(2)).map(|(store, seed)| {
-        let over = &over;
-        async move {
-            let mut dice = Dice::new(seed);
-            while !over.load(Ordering::Acquire) {
-                let cut = Duration::from_millis(dice.roll(200));
-                if let Ok(done) = tokio::time::timeout(cut, store.tidy()).await {
-                    done.unwrap();
+    let tidying =
+        futures::future::join_all(stores.iter().zip((1..).step_by(2)).map(|(store, seed)| {
+            let over = &over;
+            async move {
+                let mut dice = Dice::new(seed);
+                while !over.load(Ordering::Acquire) {
+                    let cut = Duration::from_millis(dice.roll(200));
+                    if let Ok(done) = tokio::time::timeout(cut, store.tidy()).await {
+                        done.unwrap();
+                    }
+                    tokio::time::sleep(Duration::from_millis(dice.roll(20))).await;
                 }
-                tokio::time::sleep(Duration::from_millis(dice.roll(20))).await;
             }
-        }
-    }));
+        }));
     let writing = async {
         let mut dice = Dice::new(7);
         for round in 0..rounds {
@@ -217,12 +215,12 @@ pub async fn documents_are_right_whoever_tidies(fixture: &dyn Fixture) {
             }
             let signed: Vec<String> = names
                 .into_iter()
-                .map(
-                    |name| match model.documents.contains_key(&samples::key(&name)) && dice.roll(3) == 0 {
+                .map(|name| {
+                    match model.documents.contains_key(&samples::key(&name)) && dice.roll(3) == 0 {
                         true => format!("-{name}"),
                         false => name,
-                    },
-                )
+                    }
+                })
                 .collect();
             let mut group: Vec<&str> = signed.iter().map(String::as_str).collect();
             group.push("always");

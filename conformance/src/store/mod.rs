@@ -4,8 +4,9 @@
 //! Fixture (one per store: opens stores by name) ──► rules, which panic where the store breaks one
 //! ```
 //!
-//! A store writes a [`Fixture`] and one line, [`store_conformance_tests!`](crate::store_conformance_tests), which makes
-//! a test of each rule. All waits are on conditions with a deadline, never on time alone.
+//! A store writes a [`Fixture`] and one line,
+//! [`store_conformance_tests!`](crate::store_conformance_tests), which makes a test of each rule.
+//! All waits are on conditions with a deadline, never on time alone.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -28,41 +29,46 @@ use async_trait::async_trait;
 use blaze_config::store::FullStore;
 
 pub use archive::{
-    answers_are_kept_until_they_expire, audit_is_filtered_and_paged, audit_of_commits_is_among_the_rest,
-    audit_written_twice_is_there_once, revisions_before_a_time_are_found, tokens_are_kept_and_revoked,
-    versions_come_newest_first,
+    answers_are_kept_until_they_expire, audit_is_filtered_and_paged,
+    audit_of_commits_is_among_the_rest, audit_written_twice_is_there_once,
+    revisions_before_a_time_are_found, tokens_are_kept_and_revoked, versions_come_newest_first,
 };
 pub use commits::{
-    a_group_is_written_whole, a_taken_answer_is_a_conflict, a_taken_revision_is_a_conflict, an_empty_store_is_at_zero,
-    commits_are_whole_whatever_their_size, commits_come_in_order_and_in_parts, what_was_written_is_read_back,
+    a_group_is_written_whole, a_taken_answer_is_a_conflict, a_taken_revision_is_a_conflict,
+    an_empty_store_is_at_zero, commits_are_whole_whatever_their_size,
+    commits_come_in_order_and_in_parts, what_was_written_is_read_back,
 };
 pub use many::{
-    a_foreign_commit_is_noticed, a_store_that_is_reopened_is_the_same, documents_are_right_whoever_tidies,
-    one_of_two_writers_has_each_revision, readers_never_see_a_hole_while_history_is_trimmed,
+    a_foreign_commit_is_noticed, a_store_that_is_reopened_is_the_same,
+    documents_are_right_whoever_tidies, one_of_two_writers_has_each_revision,
+    readers_never_see_a_hole_while_history_is_trimmed,
 };
 pub use trimming::{
     a_long_history_is_trimmed, a_writer_that_slept_through_a_trim_is_refused,
-    every_revision_from_the_floor_on_can_be_told, the_floor_rises_and_commits_go, versions_that_hold_or_are_young_stay,
-    what_outlives_a_commit_stays,
+    every_revision_from_the_floor_on_can_be_told, the_floor_rises_and_commits_go,
+    versions_that_hold_or_are_young_stay, what_outlives_a_commit_stays,
 };
-pub use upkeep::{a_backup_is_restored_elsewhere, a_closed_store_is_unavailable, documents_are_rewritten_in_place};
+pub use upkeep::{
+    a_backup_is_restored_elsewhere, a_closed_store_is_unavailable, documents_are_rewritten_in_place,
+};
 
 /// A server or folder for the tests of one store.
 #[async_trait]
 pub trait Fixture: Send + Sync {
-    /// Opens the store of a name, as a process of its own would; it is made, empty, when the name is new. Where
-    /// [`Fixture::is_shared`], it may be opened several times at once.
+    /// Opens the store of a name, as a process of its own would; it is made, empty, when the name
+    /// is new. Where [`Fixture::is_shared`], it may be opened several times at once.
     async fn open(&self, name: &str) -> Arc<dyn FullStore>;
 
     /// Whether several processes may use one store at once.
     fn is_shared(&self) -> bool;
 }
 
-/// The list of rules, for the tests of [`store_conformance_tests!`](crate::store_conformance_tests).
+/// The list of rules, for the tests of
+/// [`store_conformance_tests!`](crate::store_conformance_tests).
 macro_rules! rules {
     ($d:tt $($rule:ident),+ $(,)?) => {
-        /// Makes a test of each rule. The argument is an expression whose `await` gives a [`Fixture`]; it is evaluated
-        /// once for each test.
+        /// Makes a test of each rule. The argument is an expression whose `await` gives a
+        /// [`Fixture`]; it is evaluated once for each test.
         #[macro_export]
         macro_rules! store_conformance_tests {
             ($d fixture:expr) => {

@@ -6,7 +6,9 @@ use std::sync::Arc;
 use blaze_domain::config::{Document, Key, Timestamp};
 use serde_json::json;
 
-use blaze_config::store::{AuditEntry, Change, Commit, CommitRecord, IdempotencyRecord, Op, TokenRecord};
+use blaze_config::store::{
+    AuditEntry, Change, Commit, CommitRecord, IdempotencyRecord, Op, TokenRecord,
+};
 
 /// A day in the life of the samples; each revision is a second later.
 pub(crate) const START_MS: i64 = 1_795_244_400_000;
@@ -35,8 +37,10 @@ pub(crate) fn node(name: &str, revision: u64) -> Document {
         spec: Arc::new(json!({
             "layer": "edge", "type": "static",
             "config": {
-                "z": revision, "a": 0.1, "$set": {"_id": [1, null, {"a.b": {}}]}, "": "", "big": 9_007_199_254_740_991_i64,
-                "password": {"$secret": {"key": "e1", "nonce": "AAAA", "text": "BBBB", "version": revision}},
+                "z": revision, "a": 0.1, "$set": {"_id": [1, null, {"a.b": {}}]}, "": "",
+                "big": 9_007_199_254_740_991_i64,
+                "password": {"$secret": {"key": "e1", "nonce": "AAAA", "text": "BBBB",
+                    "version": revision}},
             },
         })),
         status: None,
@@ -55,10 +59,7 @@ pub(crate) fn change(op: Op, name: &str, revision: u64, previous: Option<u64>) -
 
 /// A commit that creates nodes.
 pub(crate) fn commit(revision: u64, names: &[&str]) -> Commit {
-    let changes = names
-        .iter()
-        .map(|name| change(Op::Create, name, revision, None))
-        .collect();
+    let changes = names.iter().map(|name| change(Op::Create, name, revision, None)).collect();
     commit_of(revision, changes)
 }
 
@@ -77,11 +78,7 @@ pub(crate) fn commit_of(revision: u64, changes: Vec<Change>) -> Commit {
 /// A commit with one audit entry.
 pub(crate) fn record(commit: Commit) -> CommitRecord {
     let entry = audit("update", Some(commit.revision));
-    CommitRecord {
-        commit: Arc::new(commit),
-        audit: vec![entry],
-        idempotency: None,
-    }
+    CommitRecord { commit: Arc::new(commit), audit: vec![entry], idempotency: None }
 }
 
 /// An audit entry.

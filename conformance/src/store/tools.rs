@@ -10,7 +10,8 @@ use blaze_domain::config::{Document, Key};
 use super::{Fixture, samples};
 use blaze_config::store::{Commit, CommitError, CommitRecord, FullStore, Op, StoreError};
 
-/// How long a condition may take to come true; generous, because it is only spent where a rule is broken.
+/// How long a condition may take to come true; generous, because it is only spent where a rule is
+/// broken.
 pub(super) const DEADLINE: Duration = Duration::from_secs(20);
 
 /// A name of a store that no other rule uses.
@@ -69,10 +70,7 @@ pub(super) async fn log(store: &dyn FullStore, after: u64) -> Vec<Commit> {
 
 /// Documents by key.
 pub(super) fn by_key(documents: Vec<Document>) -> BTreeMap<Key, Document> {
-    documents
-        .into_iter()
-        .map(|document| (document.key.clone(), document))
-        .collect()
+    documents.into_iter().map(|document| (document.key.clone(), document)).collect()
 }
 
 /// What the store must hold, kept beside it. Writes one commit after another.

@@ -6,8 +6,8 @@ use super::tools::{Dice, Model, commit, conflict, log};
 use blaze_config::store::AuditQuery;
 use blaze_config::store::upkeep::now;
 
-/// The floor rises to what is asked for, never falls, and never passes the newest commit; commits up to it are gone;
-/// revisions go on.
+/// The floor rises to what is asked for, never falls, and never passes the newest commit; commits
+/// up to it are gone; revisions go on.
 pub async fn the_floor_rises_and_commits_go(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "floor").await;
     assert_eq!(model.store.trim(5, 1).await.unwrap(), 0, "the floor of an empty store");
@@ -24,20 +24,12 @@ pub async fn the_floor_rises_and_commits_go(fixture: &dyn Fixture) {
             .filter(|commit| commit.revision > expected)
             .cloned()
             .collect::<Vec<_>>();
-        assert_eq!(
-            log(model.store.as_ref(), expected).await,
-            commits,
-            "commits above the floor"
-        );
+        assert_eq!(log(model.store.as_ref(), expected).await, commits, "commits above the floor");
         let below = model.store.commits_after(expected - 1, 10).await.unwrap();
         assert_eq!(below.floor, expected, "the floor that a reader below it is told");
         assert_eq!(model.store.load().await.unwrap().floor, expected, "the loaded floor");
     }
-    assert_eq!(
-        model.store.trim(99, 1).await.unwrap(),
-        9,
-        "the floor at the newest commit"
-    );
+    assert_eq!(model.store.trim(99, 1).await.unwrap(), 9, "the floor at the newest commit");
     model.check_now().await;
     assert_eq!(log(model.store.as_ref(), 9).await.len(), 0, "commits above it");
     model.write(&[&["a"], &["c"]]).await;
@@ -45,21 +37,13 @@ pub async fn the_floor_rises_and_commits_go(fixture: &dyn Fixture) {
     assert_eq!(log(model.store.as_ref(), 9).await.len(), 2, "commits after the floor");
 }
 
-/// Of each document stay the version that holds at the floor, all above it, and the newest ones that are to be kept.
+/// Of each document stay the version that holds at the floor, all above it, and the newest ones
+/// that are to be kept.
 pub async fn versions_that_hold_or_are_young_stay(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "stay").await;
     // a: 1 2 3 4 5 9, b: 1 (holds for ever), c: 2 and deleted at 3.
-    let commits: [&[&str]; 9] = [
-        &["a", "b"],
-        &["a", "c"],
-        &["a", "-c"],
-        &["a"],
-        &["a"],
-        &["d"],
-        &["d"],
-        &["d"],
-        &["a"],
-    ];
+    let commits: [&[&str]; 9] =
+        [&["a", "b"], &["a", "c"], &["a", "-c"], &["a"], &["a"], &["d"], &["d"], &["d"], &["a"]];
     for names in commits {
         model.write(&[names]).await;
     }
@@ -70,7 +54,9 @@ pub async fn versions_that_hold_or_are_young_stay(fixture: &dyn Fixture) {
         (9, 1, vec![9], vec![1]),
     ] {
         model.store.trim(floor, keep).await.unwrap();
-        for (name, expected) in [("a", a), ("b", b), ("c", if keep > 1 { vec![3, 2] } else { vec![3] })] {
+        for (name, expected) in
+            [("a", a), ("b", b), ("c", if keep > 1 { vec![3, 2] } else { vec![3] })]
+        {
             let found = model.store.versions(&samples::key(name), None, 20).await.unwrap();
             let found: Vec<u64> = found.iter().map(|version| version.revision).collect();
             assert_eq!(found, expected, "versions of {name}, trim({floor}, {keep})");
@@ -96,11 +82,9 @@ pub async fn a_long_history_is_trimmed(fixture: &dyn Fixture) {
         let found = model.store.versions(&samples::key(name), None, 1000).await.unwrap();
         found.iter().map(|version| version.revision).collect()
     };
-    for (floor, keep, oldest) in [
-        (10, 1000, newest - 999),
-        (newest - 300, 3, newest - 300),
-        (newest, 1, newest),
-    ] {
+    for (floor, keep, oldest) in
+        [(10, 1000, newest - 999), (newest - 300, 3, newest - 300), (newest, 1, newest)]
+    {
         assert_eq!(model.store.trim(floor, keep).await.unwrap(), floor, "the floor");
         let expected: Vec<u64> = (oldest..=newest).rev().collect();
         assert_eq!(revisions("a").await, expected, "versions of a, trim({floor}, {keep})");
@@ -109,8 +93,8 @@ pub async fn a_long_history_is_trimmed(fixture: &dyn Fixture) {
     model.check_now().await;
 }
 
-/// Audit entries and answers to repeat are there once each, however often their commits are trimmed away; a key that is
-/// taken stays taken.
+/// Audit entries and answers to repeat are there once each, however often their commits are trimmed
+/// away; a key that is taken stays taken.
 pub async fn what_outlives_a_commit_stays(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "outlives").await;
     let mut written = Vec::new();
@@ -123,10 +107,7 @@ pub async fn what_outlives_a_commit_stays(fixture: &dyn Fixture) {
     for floor in [0, 2, 2, 5, 6] {
         model.store.trim(floor, 1).await.unwrap();
         model.store.tidy().await.unwrap();
-        let query = AuditQuery {
-            limit: 100,
-            ..AuditQuery::default()
-        };
+        let query = AuditQuery { limit: 100, ..AuditQuery::default() };
         let audit = model.store.audit(&query).await.unwrap();
         let mut expected: Vec<_> = written.iter().flat_map(|record| record.audit.clone()).collect();
         expected.sort_by(|one, other| other.id.cmp(&one.id));
@@ -144,7 +125,8 @@ pub async fn what_outlives_a_commit_stays(fixture: &dyn Fixture) {
     model.check_now().await;
 }
 
-/// Whatever is written and trimmed, what was at each revision from the floor on can be told, exactly.
+/// Whatever is written and trimmed, what was at each revision from the floor on can be told,
+/// exactly.
 pub async fn every_revision_from_the_floor_on_can_be_told(fixture: &dyn Fixture) {
     for seed in 1..=3 {
         let mut dice = Dice::new(seed * 7_919);
@@ -163,20 +145,12 @@ pub async fn every_revision_from_the_floor_on_can_be_told(fixture: &dyn Fixture)
                 let names = names.into_iter().map(|number| format!("n{number}"));
                 group.push(
                     names
-                        .map(|name| {
-                            if delete && exists(&name) {
-                                format!("-{name}")
-                            } else {
-                                name
-                            }
-                        })
+                        .map(|name| if delete && exists(&name) { format!("-{name}") } else { name })
                         .collect::<Vec<_>>(),
                 );
             }
-            let borrowed: Vec<Vec<&str>> = group
-                .iter()
-                .map(|names| names.iter().map(String::as_str).collect())
-                .collect();
+            let borrowed: Vec<Vec<&str>> =
+                group.iter().map(|names| names.iter().map(String::as_str).collect()).collect();
             let group: Vec<&[&str]> = borrowed.iter().map(Vec::as_slice).collect();
             model.write(&group).await;
             if dice.roll(4) == 0 {
@@ -188,21 +162,14 @@ pub async fn every_revision_from_the_floor_on_can_be_told(fixture: &dyn Fixture)
         model.check_now().await;
         println!("seed {seed}, floor {floor}");
         model.check_past(floor).await;
-        let expected: Vec<_> = model
-            .commits
-            .iter()
-            .filter(|commit| commit.revision > floor)
-            .cloned()
-            .collect();
-        assert_eq!(
-            log(model.store.as_ref(), floor).await,
-            expected,
-            "the log above the floor"
-        );
+        let expected: Vec<_> =
+            model.commits.iter().filter(|commit| commit.revision > floor).cloned().collect();
+        assert_eq!(log(model.store.as_ref(), floor).await, expected, "the log above the floor");
     }
 }
 
-/// A process that was away while its next revision was given to another one and trimmed away does not get it again.
+/// A process that was away while its next revision was given to another one and trimmed away does
+/// not get it again.
 pub async fn a_writer_that_slept_through_a_trim_is_refused(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "slept").await;
     for _ in 0..10 {
@@ -218,12 +185,7 @@ pub async fn a_writer_that_slept_through_a_trim_is_refused(fixture: &dyn Fixture
             );
             let gone = record(samples::commit_of(
                 revision,
-                vec![samples::change(
-                    blaze_config::store::Op::Delete,
-                    "a",
-                    revision,
-                    Some(10),
-                )],
+                vec![samples::change(blaze_config::store::Op::Delete, "a", revision, Some(10))],
             ));
             conflict("a deletion below the floor", &model.store.commit(&[gone]).await);
         }

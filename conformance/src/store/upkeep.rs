@@ -42,19 +42,16 @@ pub async fn documents_are_rewritten_in_place(fixture: &dyn Fixture) {
     assert_eq!(log(model.store.as_ref(), 0).await.len(), 3, "commits");
 }
 
-/// A restored store has the documents, their history, audit, tokens and answers of the backup, another identity, and a
-/// revision far above; everything before it counts as trimmed. The backup is of one revision although writing went on.
+/// A restored store has the documents, their history, audit, tokens and answers of the backup,
+/// another identity, and a revision far above; everything before it counts as trimmed. The backup
+/// is of one revision although writing went on.
 pub async fn a_backup_is_restored_elsewhere(fixture: &dyn Fixture) {
     let mut model = Model::new(fixture, "backup").await;
     model.write(&[&["a", "b"], &["a"], &["-b"], &["c"]]).await;
     let mut repeated = model.record(&["a"]);
     repeated.idempotency = Some(answer("kept", 5));
     commit(model.store.as_ref(), &[repeated.clone()]).await;
-    model
-        .store
-        .add_token(&token("t"), &audit("token_create", None))
-        .await
-        .unwrap();
+    model.store.add_token(&token("t"), &audit("token_create", None)).await.unwrap();
     model.store.trim(2, 20).await.unwrap();
     let mut file = Vec::new();
     let saving = backup::write(|pieces| model.store.export(pieces), &mut file);
@@ -65,11 +62,7 @@ pub async fn a_backup_is_restored_elsewhere(fixture: &dyn Fixture) {
     let restored = backup::restore(new.as_ref(), &mut Cursor::new(&file)).await.unwrap();
     let expected = 5 + RESTORE_RAISES_BY;
     let snapshot = new.load().await.unwrap();
-    assert_eq!(
-        (snapshot.revision, snapshot.floor),
-        (expected, expected),
-        "revision and floor"
-    );
+    assert_eq!((snapshot.revision, snapshot.floor), (expected, expected), "revision and floor");
     assert_eq!(snapshot.store_id, restored.store_id, "the identity");
     assert_ne!(snapshot.store_id, summary.head.store_id, "the identity of the old one");
     assert_eq!(by_key(snapshot.documents), model.documents, "the documents");
@@ -79,10 +72,7 @@ pub async fn a_backup_is_restored_elsewhere(fixture: &dyn Fixture) {
         let old = model.store.versions(&key, None, 20).await.unwrap();
         assert_eq!(new.versions(&key, None, 20).await.unwrap(), old, "history of {name}");
     }
-    let query = AuditQuery {
-        limit: 100,
-        ..AuditQuery::default()
-    };
+    let query = AuditQuery { limit: 100, ..AuditQuery::default() };
     assert_eq!(
         new.audit(&query).await.unwrap(),
         model.store.audit(&query).await.unwrap(),
@@ -99,24 +89,13 @@ pub async fn a_backup_is_restored_elsewhere(fixture: &dyn Fixture) {
         "the answer to repeat"
     );
     let below = new.commits_after(5, 10).await.unwrap();
-    assert_eq!(
-        below.floor, expected,
-        "the floor that a follower of the old store is told"
-    );
+    assert_eq!(below.floor, expected, "the floor that a follower of the old store is told");
     // Revisions go on above, and what was at the new floor can be told.
     let mut change = samples::change(Op::Update, "a", expected + 1, Some(5));
     change.paths.clear();
-    commit(
-        new.as_ref(),
-        &[samples::record(samples::commit_of(expected + 1, vec![change]))],
-    )
-    .await;
-    let before: BTreeMap<_, _> = new
-        .documents_at(expected, expected + 1)
-        .await
-        .unwrap()
-        .into_iter()
-        .collect();
+    commit(new.as_ref(), &[samples::record(samples::commit_of(expected + 1, vec![change]))]).await;
+    let before: BTreeMap<_, _> =
+        new.documents_at(expected, expected + 1).await.unwrap().into_iter().collect();
     let of_a = before.get(&samples::key("a")).cloned().flatten();
     assert_eq!(of_a.as_ref(), model.documents.get(&samples::key("a")), "a at the floor");
     new.close().await;

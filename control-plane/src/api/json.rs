@@ -1,7 +1,7 @@
 //! Answers as JSON: bodies of REST, and what gRPC gives as text.
 //!
-//! Every function here is the one place that knows the members of its answer; the schemas of the OpenAPI document
-//! ([`super::rest`]) describe the same, and a test compares them.
+//! Every function here is the one place that knows the members of its answer; the schemas of the
+//! OpenAPI document ([`super::rest`]) describe the same, and a test compares them.
 
 use std::sync::Arc;
 
@@ -55,11 +55,8 @@ fn place_members(place: &Place) -> Map<String, Value> {
 #[must_use]
 pub fn apply_report(report: &ApplyReport) -> Value {
     let results: Vec<Value> = report.results.iter().map(apply_result).collect();
-    let affected: Vec<Value> = report
-        .affected
-        .iter()
-        .map(|place| Value::Object(place_members(place)))
-        .collect();
+    let affected: Vec<Value> =
+        report.affected.iter().map(|place| Value::Object(place_members(place))).collect();
     json!({
         "dry_run": report.dry_run,
         "revision": report.revision,
@@ -73,10 +70,7 @@ fn apply_result(result: &ApplyResult) -> Value {
     let mut members = reference(&result.key);
     members.insert("action".to_owned(), result.action.as_str().into());
     members.insert("revision".to_owned(), result.revision.into());
-    members.insert(
-        "changes".to_owned(),
-        result.changes.iter().map(Delta::to_json).collect(),
-    );
+    members.insert("changes".to_owned(), result.changes.iter().map(Delta::to_json).collect());
     Value::Object(members)
 }
 
@@ -108,10 +102,7 @@ pub fn history_entry(entry: &HistoryEntry, full: bool) -> Value {
     members.insert("request_id".to_owned(), entry.request_id.as_str().into());
     members.insert("paths".to_owned(), entry.paths.iter().map(String::as_str).collect());
     if full {
-        let document = entry
-            .document
-            .as_ref()
-            .map_or(Value::Null, |document| document.to_json());
+        let document = entry.document.as_ref().map_or(Value::Null, |document| document.to_json());
         members.insert("document".to_owned(), document);
     }
     Value::Object(members)
@@ -243,8 +234,20 @@ mod tests {
             apply_report(&report),
             json!({
                 "dry_run": false, "revision": 420,
-                "results": [{ "kind": "Instance", "name": "0", "service": "slam", "action": "created", "revision": 420, "changes": [] }],
-                "affected": [{ "service": "slam", "instance": null, "layer": "edge", "node": null }], "affected_total": 1,
+                "results": [{
+                    "kind": "Instance",
+                    "name": "0",
+                    "service": "slam",
+                    "action": "created",
+                    "revision": 420,
+                    "changes": [],
+                }],
+                "affected": [{
+                    "service": "slam",
+                    "instance": null,
+                    "layer": "edge",
+                    "node": null,
+                }], "affected_total": 1,
             })
         );
     }

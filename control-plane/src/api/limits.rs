@@ -1,12 +1,15 @@
-//! What clients may take: requests at work, requests a second, refused tokens a second, open watches, bytes of bodies.
+//! What clients may take: requests at work, requests a second, refused tokens a second, open
+//! watches, bytes of bodies.
 //!
 //! ```text
 //! body ─▶ metered, while it is received ─▶ whole ─▶ a place among the requests at work
 //! ```
 //!
-//! Only what is whole takes a place among the requests at work, so that slow senders do not hold up others. One value of [`ApiLimits`] serves REST and gRPC, so that a client cannot have twice as much by using both. Whatever is
-//! remembered about clients is bounded: the least recently seen are forgotten, with a full allowance.
-//! The buckets are our own: `governor` neither looks without taking, as the check of an address does, nor bounds its keys.
+//! Only what is whole takes a place among the requests at work, so that slow senders do not hold up
+//! others. One value of [`ApiLimits`] serves REST and gRPC, so that a client cannot have twice as
+//! much by using both. Whatever is remembered about clients is bounded: the least recently seen are
+//! forgotten, with a full allowance. The buckets are our own: `governor` neither looks without
+//! taking, as the check of an address does, nor bounds its keys.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -69,20 +72,25 @@ impl ApiLimits {
             receiving: Arc::new(Semaphore::new(RECEIVING_BYTES)),
             in_flight: Arc::new(Semaphore::new(in_flight.min(Semaphore::MAX_PERMITS))),
             requests: (section.requests_per_s > 0).then(|| Buckets::new(section.requests_per_s)),
-            failures: (section.auth_failures_per_s > 0).then(|| Buckets::new(section.auth_failures_per_s)),
+            failures: (section.auth_failures_per_s > 0)
+                .then(|| Buckets::new(section.auth_failures_per_s)),
             watches_per_subject: section.watches_per_subject,
             watches: Arc::default(),
         }
     }
 
-    /// The body of a request, whose bytes count until it is dropped. When it fails by that, [`refusal`] finds why.
+    /// The body of a request, whose bytes count until it is dropped. When it fails by that,
+    /// [`refusal`] finds why.
     pub(super) fn metered(&self, body: Body) -> Body {
         let (receiving, mut held) = (Arc::clone(&self.receiving), None::<OwnedSemaphorePermit>);
         Body::from_stream(body.into_data_stream().map(move |chunk| {
             let chunk = chunk?;
             let bytes = u32::try_from(chunk.len())?;
             let Ok(taken) = Arc::clone(&receiving).try_acquire_many_owned(bytes) else {
-                return Err(overloaded("the service receives as many bytes of bodies as it may: try again").into());
+                return Err(overloaded(
+                    "the service receives as many bytes of bodies as it may: try again",
+                )
+                .into());
             };
             match &mut held {
                 Some(held) => held.merge(taken),
@@ -107,9 +115,9 @@ impl ApiLimits {
     /// `rate_limited` if there were too many.
     pub fn count_request(&self, subject: &str) -> Result<(), Problem> {
         let Some(buckets) = &self.requests else { return Ok(()) };
-        buckets
-            .take(subject.to_owned(), Instant::now())
-            .map_err(|wait_s| limited("the subject sends more requests a second than it may", wait_s))
+        buckets.take(subject.to_owned(), Instant::now()).map_err(|wait_s| {
+            limited("the subject sends more requests a second than it may", wait_s)
+        })
     }
 
     /// Looks whether an address may still present tokens.
@@ -140,20 +148,20 @@ impl ApiLimits {
         let count = open.entry(subject.to_owned()).or_insert(0);
         if *count >= self.watches_per_subject {
             let limit = self.watches_per_subject;
-            let detail = format!("the subject has {limit} open watches, and may have no more: end one first");
+            let detail = format!(
+                "the subject has {limit} open watches, and may have no more: end one first"
+            );
             return Err(Problem::new(Code::RateLimited, detail).retry_after(5));
         }
         *count += 1;
-        Ok(WatchSlot {
-            subject: subject.to_owned(),
-            open: Arc::clone(&self.watches),
-        })
+        Ok(WatchSlot { subject: subject.to_owned(), open: Arc::clone(&self.watches) })
     }
 }
 
 /// The refusal that a failed reading of a metered body ends with, if it is one.
 pub(super) fn refusal<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a Problem> {
-    std::iter::successors(Some(error), |&error| error.source()).find_map(|error| error.downcast_ref())
+    std::iter::successors(Some(error), |&error| error.source())
+        .find_map(|error| error.downcast_ref())
 }
 
 fn overloaded(detail: &str) -> Problem {
@@ -190,10 +198,7 @@ struct Level {
 
 impl<K: Hash + Eq> Buckets<K> {
     fn new(per_s: u32) -> Self {
-        Self {
-            per_s: f64::from(per_s),
-            levels: Mutex::new(LruCache::sparse(REMEMBERED)),
-        }
+        Self { per_s: f64::from(per_s), levels: Mutex::new(LruCache::sparse(REMEMBERED)) }
     }
 
     fn now(&self, level: Option<&Level>, now: Instant) -> f64 {
@@ -211,21 +216,14 @@ impl<K: Hash + Eq> Buckets<K> {
     fn look(&self, key: &K, now: Instant) -> Result<(), u64> {
         let levels = self.levels.lock();
         let tokens = self.now(levels.peek(key), now);
-        if tokens >= 1.0 {
-            Ok(())
-        } else {
-            Err(self.wait_s(tokens))
-        }
+        if tokens >= 1.0 { Ok(()) } else { Err(self.wait_s(tokens)) }
     }
 
     fn take(&self, key: K, now: Instant) -> Result<(), u64> {
         let mut levels = self.levels.lock();
         let tokens = self.now(levels.get(&key), now);
-        let (tokens, taken) = if tokens >= 1.0 {
-            (tokens - 1.0, Ok(()))
-        } else {
-            (tokens, Err(self.wait_s(tokens)))
-        };
+        let (tokens, taken) =
+            if tokens >= 1.0 { (tokens - 1.0, Ok(())) } else { (tokens, Err(self.wait_s(tokens))) };
         levels.put(key, Level { tokens, at: now });
         taken
     }
@@ -288,9 +286,8 @@ mod tests {
     async fn bytes_of_bodies_are_bounded_while_they_are_received() {
         let limits = limits(0, 0);
         let first = vec![0; 1024];
-        let half = limits.metered(Body::from_stream(stream::iter(
-            [first, Vec::new()].map(Ok::<_, Infallible>),
-        )));
+        let half = limits
+            .metered(Body::from_stream(stream::iter([first, Vec::new()].map(Ok::<_, Infallible>))));
         let mut half = half.into_data_stream();
         assert_eq!(half.next().await.unwrap().unwrap().len(), 1024);
         let rest = u32::try_from(RECEIVING_BYTES - 1024).unwrap();

@@ -1,4 +1,5 @@
-//! The two interfaces of the main service. Both translate between a wire and the core and decide nothing themselves.
+//! The two interfaces of the main service. Both translate between a wire and the core and decide
+//! nothing themselves.
 //!
 //! ```text
 //! HTTP/1.1, HTTP/2 ─▶ rest ─┐                                        ┌─▶ core::ConfigService

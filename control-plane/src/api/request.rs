@@ -36,23 +36,23 @@ pub fn traceparent(headers: &HeaderMap) -> Option<&HeaderValue> {
     let is_version_0 = parts.next() == Some("00");
     let mut hex = |length| {
         let is_hex = |byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f');
-        parts
-            .next()
-            .filter(|part| part.len() == length && part.bytes().all(is_hex))
+        parts.next().filter(|part| part.len() == length && part.bytes().all(is_hex))
     };
     let (trace, span, _flags) = (hex(32)?, hex(16)?, hex(2)?);
     let is_set = |id: &str| id.bytes().any(|byte| byte != b'0');
     (is_version_0 && is_set(trace) && is_set(span) && parts.next().is_none()).then_some(value)
 }
 
-/// The text of the token. `None`: there is no `authorization` at all. Empty: there is one that is no `Bearer`, or more
-/// than one, so that none is a valid token.
+/// The text of the token. `None`: there is no `authorization` at all. Empty: there is one that is
+/// no `Bearer`, or more than one, so that none is a valid token.
 #[must_use]
 pub fn bearer(headers: &HeaderMap) -> Option<&str> {
     headers.get(AUTHORIZATION)?;
     let credentials = single(headers, AUTHORIZATION).and_then(|value| value.to_str().ok());
     match credentials.unwrap_or_default().split_once(' ') {
-        Some((scheme, token)) if scheme.eq_ignore_ascii_case("bearer") => Some(token.trim_matches(' ')),
+        Some((scheme, token)) if scheme.eq_ignore_ascii_case("bearer") => {
+            Some(token.trim_matches(' '))
+        }
         _ => Some(""),
     }
 }
@@ -71,21 +71,20 @@ pub fn client_address(extensions: &Extensions) -> IpAddr {
     address.map_or(IpAddr::V4(Ipv4Addr::UNSPECIFIED), |info| info.0.ip().to_canonical())
 }
 
-/// The rules of `--dev`: no page of another site that a browser of this machine shows may reach a service that asks for
-/// no token.
+/// The rules of `--dev`: no page of another site that a browser of this machine shows may reach a
+/// service that asks for no token.
 ///
 /// # Errors
 /// `permission_denied`.
 pub fn check_dev(uri: &Uri, headers: &HeaderMap) -> Result<(), Problem> {
     let header = || single(headers, HOST).and_then(|value| value.to_str().ok());
-    let host = uri
-        .authority()
-        .map(axum::http::uri::Authority::as_str)
-        .or_else(header)
-        .unwrap_or_default();
+    let host =
+        uri.authority().map(axum::http::uri::Authority::as_str).or_else(header).unwrap_or_default();
     let refuse = |detail: &str| Err(Problem::new(Code::PermissionDenied, detail));
     if !dev::host_is_loopback(host) {
-        return refuse("with --dev the service answers only under a loopback name, such as localhost");
+        return refuse(
+            "with --dev the service answers only under a loopback name, such as localhost",
+        );
     }
     let mut origins = headers.get_all(ORIGIN).iter();
     if origins.any(|origin| dev::origin_is_foreign(origin.to_str().unwrap_or_default(), host)) {

@@ -9,8 +9,8 @@ use std::time::Duration;
 use arc_swap::ArcSwap;
 use aws_lc_rs::digest::{SHA256, digest};
 use blaze_auth::{
-    Algorithm, Claims, Jwks, Key, KeySet, MAX_TOKEN_BYTES, NewToken, Realm, Refusal, SignKey, VerifyKey, read_jwks,
-    read_key,
+    Algorithm, Claims, Jwks, Key, KeySet, MAX_TOKEN_BYTES, NewToken, Realm, Refusal, SignKey,
+    VerifyKey, read_jwks, read_key,
 };
 use blaze_domain::node_file::{AuthSection, JwksSource, JwtKey};
 use blaze_runtime::{Supervisor, TaskPolicy};
@@ -70,7 +70,8 @@ struct Keys {
     told: Vec<String>,
 }
 
-/// What holds until a key changes. Accepted tokens are remembered here, and forgotten with the keys that accepted them.
+/// What holds until a key changes. Accepted tokens are remembered here, and forgotten with the keys
+/// that accepted them.
 struct Active {
     set: KeySet,
     signer: Option<(String, SignKey)>,
@@ -88,7 +89,9 @@ impl Authenticator {
         for (index, key) in section.keys.iter().enumerate() {
             match KeyFile::of(index, key) {
                 Ok(file) => files.push(file),
-                Err(reason) => faults.push(format!("control_plane.auth.keys[{index}].alg: {reason}")),
+                Err(reason) => {
+                    faults.push(format!("control_plane.auth.keys[{index}].alg: {reason}"))
+                }
             }
         }
         let mut keys = Keys::default();
@@ -116,20 +119,14 @@ impl Authenticator {
         if !faults.is_empty() {
             return Err(faults);
         }
-        let realm = Realm {
-            issuer: section.issuer.clone(),
-            audience: section.audience.clone(),
-        };
+        let realm = Realm { issuer: section.issuer.clone(), audience: section.audience.clone() };
         Ok(Self::build(realm, files, jwks_file, provider, keys))
     }
 
     /// With these keys for ever.
     #[must_use]
     pub fn with_keys(realm: Realm, local: Vec<NamedKey>) -> Self {
-        let keys = Keys {
-            local,
-            ..Keys::default()
-        };
+        let keys = Keys { local, ..Keys::default() };
         Self::build(realm, Vec::new(), None, None, keys)
     }
 
@@ -141,13 +138,7 @@ impl Authenticator {
 
     #[cfg(test)]
     pub(super) fn with_provider(provider: Provider, every: Duration) -> Self {
-        Self::build(
-            Realm::default(),
-            Vec::new(),
-            None,
-            Some((provider, every)),
-            Keys::default(),
-        )
+        Self::build(Realm::default(), Vec::new(), None, Some((provider, every)), Keys::default())
     }
 
     fn build(
@@ -196,13 +187,15 @@ impl Authenticator {
                 return;
             };
             tokio::select! {
-                () = keep_fresh(provider, *every, pause, &shared.unknown_key, |jwks| shared.take(jwks)) => {}
+                () = keep_fresh(provider, *every, pause, &shared.unknown_key,
+                    |jwks| shared.take(jwks)) => {}
                 () = stop.cancelled() => {}
             }
         });
     }
 
-    /// The claims of a token that is good at `now_s` (seconds since 1970). Whether it was revoked is asked elsewhere.
+    /// The claims of a token that is good at `now_s` (seconds since 1970). Whether it was revoked
+    /// is asked elsewhere.
     ///
     /// # Errors
     /// Why it is not, for log and audit alone.
@@ -216,12 +209,14 @@ impl Authenticator {
         if let Some(claims) = remembered.filter(|claims| !claims.is_expired(now_s)) {
             return Ok(claims);
         }
-        let found = blaze_auth::verify(token, &active.set, &self.shared.realm, now_s).map_err(|refusal| {
-            if matches!(refusal, Refusal::UnknownKey(_)) {
-                self.shared.unknown_key.notify_one();
-            }
-            refusal.to_string()
-        })?;
+        let found = blaze_auth::verify(token, &active.set, &self.shared.realm, now_s).map_err(
+            |refusal| {
+                if matches!(refusal, Refusal::UnknownKey(_)) {
+                    self.shared.unknown_key.notify_one();
+                }
+                refusal.to_string()
+            },
+        )?;
         let claims = Arc::new(found);
         if let Some(id) = id {
             active.accepted.lock().put(id, Arc::clone(&claims));
@@ -275,11 +270,7 @@ impl KeyFile {
         let bytes = read_file(&self.path)?;
         let key = read_key(self.algorithm, &bytes, self.sign)
             .map_err(|error| format!("{} (key {}) {error}", self.path.display(), self.id))?;
-        Ok(NamedKey {
-            id: self.id.clone(),
-            key,
-            sign: self.sign,
-        })
+        Ok(NamedKey { id: self.id.clone(), key, sign: self.sign })
     }
 }
 
@@ -325,7 +316,8 @@ impl Keys {
         let mut remarks = jwks.ignored;
         for (id, _) in &jwks.keys {
             if id.is_some() && self.local.iter().any(|key| id.as_ref() == Some(&key.id)) {
-                remarks.push(format!("key {id:?} has the id of a key of this machine, which holds"));
+                remarks
+                    .push(format!("key {id:?} has the id of a key of this machine, which holds"));
             }
         }
         for remark in remarks.iter().filter(|remark| !self.told.contains(remark)) {

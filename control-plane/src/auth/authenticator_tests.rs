@@ -32,14 +32,7 @@ fn roles() -> Vec<String> {
 }
 
 fn new_token<'a>(roles: &'a [String], id: &'a str) -> NewToken<'a> {
-    NewToken {
-        subject: "ops",
-        roles,
-        layer: None,
-        issued_s: NOW_S,
-        expires_s: NOW_S + 60,
-        id,
-    }
+    NewToken { subject: "ops", roles, layer: None, issued_s: NOW_S, expires_s: NOW_S + 60, id }
 }
 
 fn token(algorithm: Algorithm, private: &str, kid: &str) -> String {
@@ -49,32 +42,17 @@ fn token(algorithm: Algorithm, private: &str, kid: &str) -> String {
 }
 
 fn key(id: &str, algorithm: JwtAlgorithm, file: &Path, sign: bool) -> JwtKey {
-    JwtKey {
-        id: id.to_owned(),
-        algorithm,
-        file: file.to_owned(),
-        sign,
-    }
+    JwtKey { id: id.to_owned(), algorithm, file: file.to_owned(), sign }
 }
 
 fn section(keys: Vec<JwtKey>, jwks: Option<JwksSource>) -> AuthSection {
-    AuthSection {
-        issuer: "blaze".to_owned(),
-        audience: "blaze-config".to_owned(),
-        keys,
-        jwks,
-    }
+    AuthSection { issuer: "blaze".to_owned(), audience: "blaze-config".to_owned(), keys, jwks }
 }
 
 /// The key of an Ed25519 file as a JWK.
 fn jwk(kid: &str, made: &GeneratedKey) -> Value {
-    let body: String = made
-        .public
-        .as_ref()
-        .unwrap()
-        .lines()
-        .filter(|line| !line.starts_with("--"))
-        .collect();
+    let body: String =
+        made.public.as_ref().unwrap().lines().filter(|line| !line.starts_with("--")).collect();
     let spki = STANDARD.decode(body).unwrap();
     let x = URL_SAFE_NO_PAD.encode(&spki[spki.len() - 32..]);
     json!({ "kty": "OKP", "crv": "Ed25519", "kid": kid, "x": x })
@@ -103,25 +81,18 @@ fn what_it_signs_it_accepts_until_it_runs_out() {
     let roles = roles();
     let text = authenticator.sign(&new_token(&roles, "t-1")).unwrap().unwrap();
     let first = authenticator.verify(&text, NOW_S).unwrap();
-    assert_eq!(
-        (first.subject.as_str(), first.token_id.as_deref()),
-        ("ops", Some("t-1"))
-    );
+    assert_eq!((first.subject.as_str(), first.token_id.as_deref()), ("ops", Some("t-1")));
     let again = authenticator.verify(&text, NOW_S + 89).unwrap();
     assert!(Arc::ptr_eq(&first, &again), "it is remembered");
     assert!(authenticator.verify(&text, NOW_S + 90).is_err(), "though remembered");
     assert!(authenticator.verify(&format!("{text}A"), NOW_S).is_err());
-    assert!(
-        authenticator
-            .verify(&text.repeat(100), NOW_S)
-            .unwrap_err()
-            .contains("8192")
-    );
+    assert!(authenticator.verify(&text.repeat(100), NOW_S).unwrap_err().contains("8192"));
     let closed = Authenticator::closed();
     assert!(!closed.has_keys());
     assert!(closed.verify(&text, NOW_S).is_err());
     assert!(closed.sign(&new_token(&roles, "t")).is_none());
-    let checks_only = Authenticator::with_keys(Realm::default(), vec![NamedKey { sign: false, ..local }]);
+    let checks_only =
+        Authenticator::with_keys(Realm::default(), vec![NamedKey { sign: false, ..local }]);
     assert!(checks_only.sign(&new_token(&roles, "t")).is_none());
     assert!(checks_only.verify(&text, NOW_S).is_ok());
     assert!(!format!("{authenticator:?}").contains(made.private.trim()));
@@ -145,7 +116,10 @@ async fn keys_rotate_while_it_runs() {
     authenticator.watch_every(&supervisor, OFTEN, SOON);
     let old_token = token(Algorithm::Hs256, &old.private, "k1");
     let ed_token = token(Algorithm::EdDsa, &ed.private, "k2");
-    assert!(authenticator.verify(&old_token, NOW_S).is_ok() && authenticator.verify(&ed_token, NOW_S).is_ok());
+    assert!(
+        authenticator.verify(&old_token, NOW_S).is_ok()
+            && authenticator.verify(&ed_token, NOW_S).is_ok()
+    );
     // One file is replaced, the other spoilt: the first holds, of the second what it was.
     fs::write(&second, "no key").unwrap();
     fs::write(&first, &*new.private).unwrap();
@@ -162,10 +136,8 @@ async fn keys_rotate_while_it_runs() {
 async fn a_key_set_comes_from_a_file() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("jwks.json");
-    let (one, two) = (
-        generate_key(Algorithm::EdDsa).unwrap(),
-        generate_key(Algorithm::EdDsa).unwrap(),
-    );
+    let (one, two) =
+        (generate_key(Algorithm::EdDsa).unwrap(), generate_key(Algorithm::EdDsa).unwrap());
     fs::write(&file, json!({ "keys": [jwk("p1", &one)] }).to_string()).unwrap();
     let source = || Some(JwksSource::File(file.clone()));
     let authenticator = Authenticator::load(&section(Vec::new(), source())).unwrap();
@@ -176,7 +148,9 @@ async fn a_key_set_comes_from_a_file() {
     fs::write(&file, both.to_string()).unwrap();
     accepted(&authenticator, &token(Algorithm::EdDsa, &two.private, "p2")).await;
     fs::write(&file, "{").unwrap();
-    assert!(Authenticator::load(&section(Vec::new(), source())).unwrap_err()[0].contains("jwks.json"));
+    assert!(
+        Authenticator::load(&section(Vec::new(), source())).unwrap_err()[0].contains("jwks.json")
+    );
     assert!(supervisor.shutdown(SOON).await.is_clean());
     accepted(&authenticator, &token(Algorithm::EdDsa, &one.private, "p1")).await;
 }
@@ -191,13 +165,8 @@ fn all_faulty_files_are_told() {
         key("k2", JwtAlgorithm::Rs256, &folder.path().join("gone"), false),
         key("k3", JwtAlgorithm::Es256, &file, false),
     ];
-    let source = JwksSource::Url {
-        url: "http://127.0.0.1/keys".to_owned().into(),
-        refresh_s: 300,
-    };
-    let faults = Authenticator::load(&section(keys, Some(source)))
-        .unwrap_err()
-        .join("\n");
+    let source = JwksSource::Url { url: "http://127.0.0.1/keys".to_owned().into(), refresh_s: 300 };
+    let faults = Authenticator::load(&section(keys, Some(source))).unwrap_err().join("\n");
     for part in [
         "control_plane.auth.keys[0].file: ",
         "(key k1) holds 5 bytes",
@@ -232,10 +201,8 @@ async fn identity_provider() -> Served {
         client_ca_file: None,
         allow_plaintext: false,
     };
-    let (keys, asked) = (
-        Arc::new(Mutex::new(json!({ "keys": [] }))),
-        Arc::new(AtomicUsize::new(0)),
-    );
+    let (keys, asked) =
+        (Arc::new(Mutex::new(json!({ "keys": [] }))), Arc::new(AtomicUsize::new(0)));
     let (given, count) = (Arc::clone(&keys), Arc::clone(&asked));
     let answer = move || {
         count.fetch_add(1, Ordering::Relaxed);
@@ -246,25 +213,15 @@ async fn identity_provider() -> Served {
         .route("/keys", get(answer))
         .route("/moved", get(|| async { Redirect::temporary("/keys") }))
         .route("/large", get(|| async { "x".repeat(256 * 1024 + 1) }))
-        .route(
-            "/broken",
-            get(|| async { StatusCode::INTERNAL_SERVER_ERROR.into_response() }),
-        );
+        .route("/broken", get(|| async { StatusCode::INTERNAL_SERVER_ERROR.into_response() }));
     let supervisor = Supervisor::new("test");
     let any = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let tls = Tls::load(&tls).unwrap();
-    let listener = Listener::bind("rest", any, tls, Protocols::Both, ListenLimits::default())
-        .await
-        .unwrap();
+    let listener =
+        Listener::bind("rest", any, tls, Protocols::Both, ListenLimits::default()).await.unwrap();
     let base = format!("https://localhost:{}", listener.local_addr().port());
     listener.serve(&supervisor, router, &ApiMetrics::new().unwrap());
-    Served {
-        supervisor,
-        keys,
-        asked,
-        base,
-        root,
-    }
+    Served { supervisor, keys, asked, base, root }
 }
 
 impl Served {
@@ -277,32 +234,23 @@ impl Served {
 #[tokio::test]
 async fn a_key_set_is_fetched_and_fetched_again_for_an_unknown_key() {
     let served = identity_provider().await;
-    let (one, two) = (
-        generate_key(Algorithm::EdDsa).unwrap(),
-        generate_key(Algorithm::EdDsa).unwrap(),
-    );
+    let (one, two) =
+        (generate_key(Algorithm::EdDsa).unwrap(), generate_key(Algorithm::EdDsa).unwrap());
     *served.keys.lock() = json!({ "keys": [jwk("p1", &one)] });
-    let authenticator = Authenticator::with_provider(served.provider("/keys"), Duration::from_secs(3600));
+    let authenticator =
+        Authenticator::with_provider(served.provider("/keys"), Duration::from_secs(3600));
     assert!(!authenticator.has_keys());
     authenticator.watch_every(&served.supervisor, OFTEN, OFTEN);
     accepted(&authenticator, &token(Algorithm::EdDsa, &one.private, "p1")).await;
     let before = served.asked.load(Ordering::Relaxed);
     for _ in 0..100 {
-        assert!(
-            authenticator
-                .verify(&token(Algorithm::EdDsa, &one.private, "p1"), NOW_S)
-                .is_ok()
-        );
+        assert!(authenticator.verify(&token(Algorithm::EdDsa, &one.private, "p1"), NOW_S).is_ok());
     }
     *served.keys.lock() = json!({ "keys": [jwk("p2", &two)] });
     // Nothing but the unknown key makes it ask within the hour.
     accepted(&authenticator, &token(Algorithm::EdDsa, &two.private, "p2")).await;
     assert!(served.asked.load(Ordering::Relaxed) > before);
-    assert!(
-        authenticator
-            .verify(&token(Algorithm::EdDsa, &one.private, "p1"), NOW_S)
-            .is_err()
-    );
+    assert!(authenticator.verify(&token(Algorithm::EdDsa, &one.private, "p1"), NOW_S).is_err());
     // What is no key set leaves the keys as they were.
     *served.keys.lock() = json!([]);
     let before = served.asked.load(Ordering::Relaxed);
@@ -314,18 +262,15 @@ async fn a_key_set_is_fetched_and_fetched_again_for_an_unknown_key() {
         }
     };
     tokio::time::timeout(SOON, asked_again).await.unwrap();
-    assert!(
-        authenticator
-            .verify(&token(Algorithm::EdDsa, &two.private, "p2"), NOW_S)
-            .is_ok()
-    );
+    assert!(authenticator.verify(&token(Algorithm::EdDsa, &two.private, "p2"), NOW_S).is_ok());
     assert!(served.supervisor.shutdown(SOON).await.is_clean());
 }
 
 #[tokio::test]
 async fn unknown_keys_do_not_make_it_ask_often() {
     let served = identity_provider().await;
-    let authenticator = Authenticator::with_provider(served.provider("/keys"), Duration::from_secs(3600));
+    let authenticator =
+        Authenticator::with_provider(served.provider("/keys"), Duration::from_secs(3600));
     authenticator.watch_every(&served.supervisor, OFTEN, Duration::from_secs(3600));
     let unknown = token(Algorithm::EdDsa, &generate_key(Algorithm::EdDsa).unwrap().private, "p9");
     let asked = async {
@@ -345,12 +290,9 @@ async fn unknown_keys_do_not_make_it_ask_often() {
 #[tokio::test]
 async fn answers_that_cannot_be_trusted_are_refused() {
     let served = identity_provider().await;
-    for (path, part) in [
-        ("/moved", "307"),
-        ("/large", "262144"),
-        ("/broken", "500"),
-        ("/none", "404"),
-    ] {
+    for (path, part) in
+        [("/moved", "307"), ("/large", "262144"), ("/broken", "500"), ("/none", "404")]
+    {
         let reason = served.provider(path).fetch().await.unwrap_err();
         assert!(reason.contains(part), "{path}: {reason}");
         assert!(!reason.contains("localhost"), "{reason}");

@@ -1,4 +1,5 @@
-//! `--dev`: no token is needed, so only programs of this machine may come, and no web page that a browser here shows.
+//! `--dev`: no token is needed, so only programs of this machine may come, and no web page that a
+//! browser here shows.
 
 use std::net::IpAddr;
 
@@ -9,7 +10,8 @@ use blaze_auth::{Claims, Role};
 pub fn claims() -> Claims {
     Claims {
         subject: "dev".to_owned(),
-        // Also as a worker of any layer: whoever tries the system out on one machine has no tokens for that either.
+        // Also as a worker of any layer: whoever tries the system out on one machine has no tokens
+        // for that either.
         roles: vec![Role::Admin.as_str().to_owned(), Role::Worker.as_str().to_owned()],
         layer: None,
         expires_s: None,
@@ -17,17 +19,14 @@ pub fn claims() -> Claims {
     }
 }
 
-/// Whether a `Host` header (or `:authority`) names this machine by its loopback name or address. A page of another name
-/// that resolves to 127.0.0.1 (DNS rebinding) names itself there.
+/// Whether a `Host` header (or `:authority`) names this machine by its loopback name or address. A
+/// page of another name that resolves to 127.0.0.1 (DNS rebinding) names itself there.
 #[must_use]
 pub fn host_is_loopback(host: &str) -> bool {
     let Some((name, _)) = split_host(host) else {
         return false;
     };
-    let address = name
-        .strip_prefix('[')
-        .and_then(|name| name.strip_suffix(']'))
-        .unwrap_or(name);
+    let address = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
     match address.parse::<IpAddr>() {
         Ok(address) => address.to_canonical().is_loopback(),
         Err(_) => name.eq_ignore_ascii_case("localhost"),
@@ -37,13 +36,16 @@ pub fn host_is_loopback(host: &str) -> bool {
 /// Whether a request with this `Origin` comes from a page that was not served under this `Host`.
 #[must_use]
 pub fn origin_is_foreign(origin: &str, host: &str) -> bool {
-    let of_scheme = |scheme: &str, port: u16| origin.strip_prefix(scheme).map(|authority| (authority, port));
-    let Some((authority, port)) = of_scheme("http://", 80).or_else(|| of_scheme("https://", 443)) else {
+    let of_scheme =
+        |scheme: &str, port: u16| origin.strip_prefix(scheme).map(|authority| (authority, port));
+    let Some((authority, port)) = of_scheme("http://", 80).or_else(|| of_scheme("https://", 443))
+    else {
         return true;
     };
     match (split_host(authority), split_host(host)) {
         (Some((name, own_port)), Some((other_name, other_port))) => {
-            !name.eq_ignore_ascii_case(other_name) || own_port.unwrap_or(port) != other_port.unwrap_or(port)
+            !name.eq_ignore_ascii_case(other_name)
+                || own_port.unwrap_or(port) != other_port.unwrap_or(port)
         }
         _ => true,
     }
@@ -141,7 +143,9 @@ mod tests {
     proptest! {
         #[test]
         fn no_text_panics(origin in ".{0,40}", host in "[a-z0-9:.\\[\\]]{0,30}") {
-            let _ = (host_is_loopback(&origin), host_is_loopback(&host), origin_is_foreign(&origin, &host));
+            let _ =
+                (host_is_loopback(&origin), host_is_loopback(&host),
+                origin_is_foreign(&origin, &host));
         }
     }
 }

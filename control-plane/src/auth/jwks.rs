@@ -1,6 +1,7 @@
 //! Keys of an identity provider, fetched over HTTPS again and again.
 //!
-//! No redirects, no proxy, bounded time and size: whoever could lead this request elsewhere could sign tokens.
+//! No redirects, no proxy, bounded time and size: whoever could lead this request elsewhere could
+//! sign tokens.
 
 use std::error::Error;
 use std::time::Duration;
@@ -74,7 +75,8 @@ impl Provider {
     }
 }
 
-/// Fetches for ever: every `every`, soon after a failure, and when a token names an unknown key; never two within `least`.
+/// Fetches for ever: every `every`, soon after a failure, and when a token names an unknown key;
+/// never two within `least`.
 pub(super) async fn keep_fresh(
     provider: &Provider,
     every: Duration,

@@ -18,5 +18,7 @@ mod revocations;
 pub mod startup;
 
 pub use authenticator::{Authenticator, NamedKey};
-pub use blaze_auth::{Algorithm, Claims, Key as TokenKey, NewToken, Realm, Right, Role, allowed, read_key, unbound};
+pub use blaze_auth::{
+    Algorithm, Claims, Key as TokenKey, NewToken, Realm, Right, Role, allowed, read_key, unbound,
+};
 pub use revocations::Revocations;

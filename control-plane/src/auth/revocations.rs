@@ -6,8 +6,8 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 use tokio::sync::watch;
 
-/// The revoked tokens by `jti`, shared by its clones. Who reads the store tells of them; who holds a stream open waits
-/// for [`Revocations::changed`] and asks again.
+/// The revoked tokens by `jti`, shared by its clones. Who reads the store tells of them; who holds
+/// a stream open waits for [`Revocations::changed`] and asks again.
 #[derive(Debug, Clone)]
 pub struct Revocations {
     shared: Arc<Shared>,
@@ -24,10 +24,7 @@ struct Shared {
 impl Default for Revocations {
     fn default() -> Self {
         Self {
-            shared: Arc::new(Shared {
-                revoked: ArcSwap::default(),
-                serial: watch::Sender::new(0),
-            }),
+            shared: Arc::new(Shared { revoked: ArcSwap::default(), serial: watch::Sender::new(0) }),
         }
     }
 }
@@ -57,14 +54,15 @@ impl Revocations {
         self.len() == 0
     }
 
-    /// What the store says: `jti` and expiry, in seconds since 1970. A revocation is for ever, so what was known stays
-    /// known until the token has run out at `now_s`; an older list does no harm. Tells of it if there is one that was
-    /// not known.
+    /// What the store says: `jti` and expiry, in seconds since 1970. A revocation is for ever, so
+    /// what was known stays known until the token has run out at `now_s`; an older list does no
+    /// harm. Tells of it if there is one that was not known.
     pub fn learn(&self, revoked: impl IntoIterator<Item = (String, i64)>, now_s: i64) {
         // Within the lock of the counter, so that nothing is lost between two that write.
         self.shared.serial.send_if_modified(|serial| {
             let before = self.shared.revoked.load_full();
-            let mut all: HashMap<String, i64> = before.iter().map(|(id, expires_s)| (id.clone(), *expires_s)).collect();
+            let mut all: HashMap<String, i64> =
+                before.iter().map(|(id, expires_s)| (id.clone(), *expires_s)).collect();
             all.extend(revoked);
             all.retain(|_, expires_s| lasts(*expires_s, now_s));
             let news = all.keys().any(|id| !before.contains_key(id));
@@ -117,7 +115,11 @@ mod tests {
         revocations.learn([entry("a", 1_000), entry("old", 900)], 1_000);
         assert!(changed.has_changed().unwrap());
         changed.mark_unchanged();
-        assert!(revocations.is_revoked("a") && !revocations.is_revoked("old") && !revocations.is_revoked("b"));
+        assert!(
+            revocations.is_revoked("a")
+                && !revocations.is_revoked("old")
+                && !revocations.is_revoked("b")
+        );
         revocations.learn([entry("a", 1_000)], 1_000);
         assert!(!changed.has_changed().unwrap(), "nothing is new");
         revocations.add("b", 2_000);

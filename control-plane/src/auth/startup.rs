@@ -19,8 +19,10 @@ pub fn check_startup(section: &ControlPlaneSection, dev: bool) -> Result<(), Vec
         Some(auth) => check_auth(auth, dev, &mut faults),
         None if dev => {}
         None => faults.push(
-            "control_plane.auth: no key to check tokens with, so nobody could be told from anybody. Name one in \
-             control_plane.auth.keys (`blaze token keygen` makes one) or control_plane.auth.jwks; to try things out on \
+            "control_plane.auth: no key to check tokens with, so nobody could be told from \
+             anybody. Name one in \
+             control_plane.auth.keys (`blaze token keygen` makes one) or control_plane.auth.jwks; \
+             to try things out on \
              this machine alone, start with --dev"
                 .to_owned(),
         ),
@@ -35,15 +37,19 @@ fn check_listeners(section: &ControlPlaneSection, dev: bool, faults: &mut Vec<St
     let has_tls = tls.cert_file.is_some() && tls.key_file.is_some();
     if tls.client_ca_file.is_some() && !has_tls {
         faults.push(
-            "control_plane.tls.client_ca_file: client certificates need TLS; set cert_file and key_file too".to_owned(),
+            "control_plane.tls.client_ca_file: client certificates need TLS; set cert_file and \
+             key_file too"
+                .to_owned(),
         );
     }
     let with_tokens = [("rest", section.rest.listen), ("grpc", section.grpc.listen)];
     for (name, address) in with_tokens {
         if !address.ip().to_canonical().is_loopback() && !has_tls && !tls.allow_plaintext && !dev {
             faults.push(format!(
-                "control_plane.{name}.listen: {address} would carry tokens in clear over the network. Set \
-                 control_plane.tls.cert_file and key_file, listen on loopback, or (where something else encrypts) set \
+                "control_plane.{name}.listen: {address} would carry tokens in clear over the \
+                 network. Set \
+                 control_plane.tls.cert_file and key_file, listen on loopback, or (where something \
+                 else encrypts) set \
                  control_plane.tls.allow_plaintext: true"
             ));
         }
@@ -54,7 +60,8 @@ fn check_listeners(section: &ControlPlaneSection, dev: bool, faults: &mut Vec<St
     for (name, address) in with_tokens.into_iter().chain([("admin", section.admin.listen)]) {
         if !address.ip().to_canonical().is_loopback() {
             faults.push(format!(
-                "control_plane.{name}.listen: {address} is reached from outside, and --dev asks nobody for a token; \
+                "control_plane.{name}.listen: {address} is reached from outside, and --dev asks \
+                 nobody for a token; \
                  listen on 127.0.0.1"
             ));
         }
@@ -63,29 +70,24 @@ fn check_listeners(section: &ControlPlaneSection, dev: bool, faults: &mut Vec<St
 
 fn check_auth(auth: &AuthSection, dev: bool, faults: &mut Vec<String>) {
     if auth.keys.is_empty() && auth.jwks.is_none() && !dev {
-        faults.push("control_plane.auth: names neither keys nor jwks, so no token could be checked".to_owned());
+        faults.push(
+            "control_plane.auth: names neither keys nor jwks, so no token could be checked"
+                .to_owned(),
+        );
     }
     for (name, text) in [("issuer", &auth.issuer), ("audience", &auth.audience)] {
         if text.is_empty() {
             faults.push(format!("control_plane.auth.{name}: is empty"));
         }
     }
-    check_ids(
-        "control_plane.auth.keys",
-        auth.keys.iter().map(|key| key.id.as_str()),
-        faults,
-    );
+    check_ids("control_plane.auth.keys", auth.keys.iter().map(|key| key.id.as_str()), faults);
     for (index, key) in auth.keys.iter().enumerate() {
         if let Err(reason) = algorithm(key.algorithm) {
             faults.push(format!("control_plane.auth.keys[{index}].alg: {reason}"));
         }
     }
-    let signing: Vec<&str> = auth
-        .keys
-        .iter()
-        .filter(|key| key.sign)
-        .map(|key| key.id.as_str())
-        .collect();
+    let signing: Vec<&str> =
+        auth.keys.iter().filter(|key| key.sign).map(|key| key.id.as_str()).collect();
     if signing.len() > 1 {
         let names = signing.join(", ");
         faults.push(format!(
@@ -97,7 +99,9 @@ fn check_auth(auth: &AuthSection, dev: bool, faults: &mut Vec<String>) {
     {
         // The URL itself may hold a password.
         faults.push(
-            "control_plane.auth.jwks.url: must start with https://; keys that come in clear prove nothing".to_owned(),
+            "control_plane.auth.jwks.url: must start with https://; keys that come in clear prove \
+             nothing"
+                .to_owned(),
         );
     }
 }
@@ -124,7 +128,11 @@ pub(super) fn algorithm(word: JwtAlgorithm) -> Result<Algorithm, String> {
         JwtAlgorithm::Hs256 => Ok(Algorithm::Hs256),
         JwtAlgorithm::Rs256 => Ok(Algorithm::Rs256),
         JwtAlgorithm::EdDsa => Ok(Algorithm::EdDsa),
-        JwtAlgorithm::Hs384 | JwtAlgorithm::Hs512 | JwtAlgorithm::Ps256 | JwtAlgorithm::Es256 | JwtAlgorithm::Es384 => {
+        JwtAlgorithm::Hs384
+        | JwtAlgorithm::Hs512
+        | JwtAlgorithm::Ps256
+        | JwtAlgorithm::Es256
+        | JwtAlgorithm::Es384 => {
             Err(format!("{word} is not taken for tokens; take HS256, RS256 or EdDSA"))
         }
     }
@@ -139,12 +147,7 @@ mod tests {
     use super::*;
 
     fn key(id: &str, algorithm: JwtAlgorithm, sign: bool) -> JwtKey {
-        JwtKey {
-            id: id.to_owned(),
-            algorithm,
-            file: PathBuf::from("jwt.key"),
-            sign,
-        }
+        JwtKey { id: id.to_owned(), algorithm, file: PathBuf::from("jwt.key"), sign }
     }
 
     fn with_keys(keys: Vec<JwtKey>) -> ControlPlaneSection {
@@ -208,10 +211,7 @@ mod tests {
             key("", JwtAlgorithm::Hs256, false),
         ]);
         section.encryption.keys = ["e1", "e1"]
-            .map(|id| EncryptionKey {
-                id: id.to_owned(),
-                file: PathBuf::from("enc.key"),
-            })
+            .map(|id| EncryptionKey { id: id.to_owned(), file: PathBuf::from("enc.key") })
             .to_vec();
         if let Some(auth) = &mut section.auth {
             auth.issuer.clear();

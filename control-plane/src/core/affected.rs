@@ -1,4 +1,5 @@
-//! Which places a set of changed documents can concern, and whose effective configuration really is another one.
+//! Which places a set of changed documents can concern, and whose effective configuration really is
+//! another one.
 
 use std::collections::BTreeSet;
 use std::rc::Rc;
@@ -12,12 +13,14 @@ use blaze_domain::config::effective::{At, Sources, canaries, is_canary};
 use blaze_domain::config::placement::rollout_target;
 use blaze_domain::config::state::State;
 
-/// Places that are looked at for one request, at most: beyond it the answer would take longer than it is worth.
+/// Places that are looked at for one request, at most: beyond it the answer would take longer than
+/// it is worth.
 pub(crate) const MAX_CANDIDATES: usize = 200_000;
 /// The same for an answer that is kept with the commit: nobody can write while it is worked out.
 pub(crate) const MAX_KEPT_CANDIDATES: usize = 1000;
 
-/// Bytes of configurations that are merged and compared for each place that may be told, at most in the mean.
+/// Bytes of configurations that are merged and compared for each place that may be told, at most in
+/// the mean.
 const BYTES_PER_PLACE: usize = 64 * 1024;
 /// The same for all of them.
 const MAX_BYTES: usize = 1024 * 1024 * 1024;
@@ -27,7 +30,8 @@ const LOOKS_PER_PLACE: usize = 25;
 /// The same for few places together.
 const LOOKS_AT_LEAST: usize = 1_000_000;
 
-/// A search for places that finds no more than so many, and looks at no more documents on the way than it may.
+/// A search for places that finds no more than so many, and looks at no more documents on the way
+/// than it may.
 struct Search<'s> {
     state: &'s State,
     /// Services that count.
@@ -39,7 +43,8 @@ struct Search<'s> {
     looks: usize,
 }
 
-/// Instances with a document, and services without an instance at the layers and nodes that treat them on their own.
+/// Instances with a document, and services without an instance at the layers and nodes that treat
+/// them on their own.
 fn candidates<'s>(
     state: &'s State,
     keys: &[Key],
@@ -94,7 +99,8 @@ impl<'s> Search<'s> {
             }
             Kind::Node => {
                 let node = NodeName::from(key.name());
-                let layer: Option<LayerName> = state.get(key).and_then(|held| held.document.spec_layer()?.parse().ok());
+                let layer: Option<LayerName> =
+                    state.get(key).and_then(|held| held.document.spec_layer()?.parse().ok());
                 let seen_by = match state.get(key) {
                     Some(_) => layer.as_ref().map(LayerName::as_str),
                     None => Some(node.as_str()),
@@ -178,8 +184,9 @@ impl<'s> Search<'s> {
             .collect()
     }
 
-    /// A service without instance in a layer: on no node, on each node that has something of its own to say, and on each
-    /// where a roll-out tries a change of the service, the layer or the node.
+    /// A service without instance in a layer: on no node, on each node that has something of its
+    /// own to say, and on each where a roll-out tries a change of the service, the layer or the
+    /// node.
     fn at_layer(&mut self, service: &ServiceName, layer: &LayerName) {
         let state = self.state;
         let visible = state
@@ -222,16 +229,14 @@ impl<'s> Search<'s> {
 
 /// Whether a node has something of its own to say to a service.
 fn own_word(node: &Document, service: &ServiceName) -> bool {
-    let is_empty = |value: &serde_json::Value| value.as_object().is_some_and(serde_json::Map::is_empty);
+    let is_empty =
+        |value: &serde_json::Value| value.as_object().is_some_and(serde_json::Map::is_empty);
     let overrides = node.overrides(service.as_str());
-    [node.config(), overrides]
-        .into_iter()
-        .flatten()
-        .any(|config| !is_empty(config))
+    [node.config(), overrides].into_iter().flatten().any(|config| !is_empty(config))
 }
 
-/// Places of wanted services whose effective configuration may be another one after the change; `None` if they are more
-/// than `limit`, or too hard to find.
+/// Places of wanted services whose effective configuration may be another one after the change;
+/// `None` if they are more than `limit`, or too hard to find.
 pub(crate) fn touched(
     state: &State,
     keys: &[Key],
@@ -243,9 +248,16 @@ pub(crate) fn touched(
     (!search.is_full()).then_some(search.found)
 }
 
-/// Places whose effective configuration is another one, in order, as far as they are seen. Of each state at most `limit`
-/// are looked at, and no more bytes of configurations than so many places usually have.
-pub(crate) fn changed(before: &State, after: &State, keys: &[Key], view: &View, limit: usize) -> Vec<At> {
+/// Places whose effective configuration is another one, in order, as far as they are seen. Of each
+/// state at most `limit` are looked at, and no more bytes of configurations than so many places
+/// usually have.
+pub(crate) fn changed(
+    before: &State,
+    after: &State,
+    keys: &[Key],
+    view: &View,
+    limit: usize,
+) -> Vec<At> {
     let all = |_: &ServiceName| true;
     let mut places = candidates(before, keys, &all, limit).found;
     places.extend(candidates(after, keys, &all, limit).found);
@@ -268,12 +280,11 @@ pub(crate) fn changed(before: &State, after: &State, keys: &[Key], view: &View, 
 
 /// Whether the service, and the instance if one is named, is there to have a configuration.
 fn exists(state: &State, at: &At) -> bool {
-    let service = at
-        .service
-        .as_ref()
-        .is_some_and(|name| state.get(&Key::service(name)).is_some());
+    let service = at.service.as_ref().is_some_and(|name| state.get(&Key::service(name)).is_some());
     match (&at.service, &at.instance) {
-        (Some(service), Some(instance)) => state.get(&Key::instance(service.clone(), instance.clone())).is_some(),
+        (Some(service), Some(instance)) => {
+            state.get(&Key::instance(service.clone(), instance.clone())).is_some()
+        }
         _ => service,
     }
 }

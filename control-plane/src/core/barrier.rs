@@ -1,7 +1,8 @@
 //! Reads that see every write that was acknowledged before them, through whichever process.
 //!
-//! All who wait share one look at the store's newest revision. Who comes while a look is under way waits for the next one:
-//! the one under way may be older than a write that was acknowledged just before.
+//! All who wait share one look at the store's newest revision. Who comes while a look is under way
+//! waits for the next one: the one under way may be older than a write that was acknowledged just
+//! before.
 
 use tokio::sync::{mpsc, oneshot};
 
@@ -34,9 +35,13 @@ impl Barrier {
     pub(crate) async fn revision(&self) -> Result<u64, Problem> {
         let (sender, receiver) = oneshot::channel();
         self.queue.try_send(sender).map_err(|_| {
-            Problem::new(Code::Overloaded, "too many reads wait for the store; try again").retry_after(1)
+            Problem::new(Code::Overloaded, "too many reads wait for the store; try again")
+                .retry_after(1)
         })?;
-        let ended = || Problem::new(Code::ShuttingDown, "the service is ending; try again elsewhere").retry_after(1);
+        let ended = || {
+            Problem::new(Code::ShuttingDown, "the service is ending; try again elsewhere")
+                .retry_after(1)
+        };
         receiver.await.map_err(|_| ended())?
     }
 }

@@ -21,16 +21,18 @@ use blaze_domain::config::state::State;
 
 /// Faults that are told, at most.
 const MAX_FAULTS: usize = 20;
-/// How long the schemas and the effective configurations of one commit are checked: nobody else can write meanwhile.
+/// How long the schemas and the effective configurations of one commit are checked: nobody else can
+/// write meanwhile.
 pub(super) const TIME: Duration = Duration::from_secs(8);
 
 /// The deadline of a check came.
 struct TooLate;
 
 impl Schemas {
-    /// Checks every effective configuration that changed documents can concern: its size, and its service's schema. Of
-    /// what is outside the view no more is told than that it would not do. What would take too long is refused: nothing is
-    /// left unchecked, but for what was too costly before the change.
+    /// Checks every effective configuration that changed documents can concern: its size, and its
+    /// service's schema. Of what is outside the view no more is told than that it would not do.
+    /// What would take too long is refused: nothing is left unchecked, but for what was too costly
+    /// before the change.
     pub(crate) fn check_effective(
         &self,
         before: &State,
@@ -50,7 +52,8 @@ impl Schemas {
         places: usize,
         deadline: Instant,
     ) -> Vec<FieldFault> {
-        // Most writes concern no schema at all; to find the places that they touch would cost more than the write.
+        // Most writes concern no schema at all; to find the places that they touch would cost more
+        // than the write.
         let matters = |key: &&Key| {
             if is_other_in_name_only(before, state, key) {
                 return false;
@@ -94,13 +97,15 @@ impl Schemas {
     }
 }
 
-/// Whether a document is as it was in all that configurations are made of: its labels place nothing, but a roll-out
-/// finds its nodes by them.
+/// Whether a document is as it was in all that configurations are made of: its labels place
+/// nothing, but a roll-out finds its nodes by them.
 fn is_other_in_name_only(before: &State, after: &State, key: &Key) -> bool {
     let (Some(was), Some(is)) = (before.get(key), after.get(key)) else {
         return false;
     };
-    key.kind() != Kind::Node && was.document.spec == is.document.spec && was.document.status == is.document.status
+    key.kind() != Kind::Node
+        && was.document.spec == is.document.spec
+        && was.document.status == is.document.status
 }
 
 /// A service as it was met, with its schema compiled.
@@ -148,7 +153,12 @@ impl Check<'_> {
         Ok(())
     }
 
-    fn schema(&mut self, sources: &Sources, at: &At, found: &mut Vec<FieldFault>) -> Result<(), TooLate> {
+    fn schema(
+        &mut self,
+        sources: &Sources,
+        at: &At,
+        found: &mut Vec<FieldFault>,
+    ) -> Result<(), TooLate> {
         let Some(compiled) = self.compiled(sources) else {
             return Ok(());
         };
@@ -186,12 +196,13 @@ impl Check<'_> {
             let errors = validator.iter_errors(&config).filter(is_told);
             errors.take(left).map(|error| mismatch(&error, at)).collect()
         };
-        found.extend(pattern::within(self.deadline, faults).unwrap_or_else(|| vec![some_fault(at)]));
+        found
+            .extend(pattern::within(self.deadline, faults).unwrap_or_else(|| vec![some_fault(at)]));
         Ok(())
     }
 
-    /// Whether the configuration of a place was too costly to check before the change already: stored when more was
-    /// allowed, it must not stand in the way of other changes.
+    /// Whether the configuration of a place was too costly to check before the change already:
+    /// stored when more was allowed, it must not stand in the way of other changes.
     fn was_too_costly(&mut self, at: &At) -> bool {
         is_place(self.before, at) && {
             let sources = Sources::at(self.before, at);
@@ -200,18 +211,26 @@ impl Check<'_> {
         }
     }
 
-    /// The schema of a place's service, with what a roll-out makes of it there, compiled, if it can be.
+    /// The schema of a place's service, with what a roll-out makes of it there, compiled, if it can
+    /// be.
     fn compiled(&mut self, sources: &Sources) -> Option<Arc<Compiled>> {
         let service = sources.service.as_ref()?;
         let schema = service.spec_member("schema").filter(|schema| !schema.is_null())?;
         self.known.retain(|(known, _)| known.key == service.key);
-        let same = |(known, _): &&Known| Arc::ptr_eq(known, service) || known.spec_member("schema") == Some(schema);
+        let same = |(known, _): &&Known| {
+            Arc::ptr_eq(known, service) || known.spec_member("schema") == Some(schema)
+        };
         if let Some((_, compiled)) = self.known.iter().find(same) {
             return compiled.clone();
         }
         let compiled = self.schemas.compiled(schema).inspect_err(|reason| {
-            // It was sound when it was written; a newer program may see it otherwise, and must not block every write.
-            tracing::warn!(service = %service.key, reason, "the stored schema cannot be compiled; it is not checked");
+            // It was sound when it was written; a newer program may see it otherwise, and must not
+            // block every write.
+            tracing::warn!(
+                service = %service.key,
+                reason,
+                "the stored schema cannot be compiled; it is not checked",
+            );
         });
         let compiled = compiled.ok();
         self.known.push((Arc::clone(service), compiled.clone()));
@@ -233,7 +252,8 @@ fn checked(sources: &Sources) -> (Value, HashSet<String>) {
     (config, secrets)
 }
 
-/// Whether a place is one whose configuration is checked: the instance is placed there, or the service may be seen there.
+/// Whether a place is one whose configuration is checked: the instance is placed there, or the
+/// service may be seen there.
 fn is_place(state: &State, at: &At) -> bool {
     let Some(service) = &at.service else { return false };
     if let Some(instance) = &at.instance {
@@ -247,18 +267,22 @@ fn is_place(state: &State, at: &At) -> bool {
     };
     let is_there = |node: &NodeName| {
         let held = state.get(&Key::node(node));
-        held.is_some_and(|held| held.document.spec_layer() == at.layer.as_ref().map(LayerName::as_str))
+        held.is_some_and(|held| {
+            held.document.spec_layer() == at.layer.as_ref().map(LayerName::as_str)
+        })
     };
     at.layer.as_ref().is_some_and(is_seen) && at.node.as_ref().is_none_or(is_there)
 }
 
-/// A fault of which it would take too much to say where it is: a choice of subschemas tells what is wrong with each.
+/// A fault of which it would take too much to say where it is: a choice of subschemas tells what is
+/// wrong with each.
 fn some_fault(at: &At) -> FieldFault {
     FieldFault {
         pointer: "/spec/config".to_owned(),
         code: Code::SchemaMismatch,
         detail: format!(
-            "effective configuration of {}: it does not match the schema; the two are too large together to say where (of a \
+            "effective configuration of {}: it does not match the schema; the two are too large \
+             together to say where (of a \
              secret, `const` and `enum` do not hold)",
             described(at)
         ),
@@ -281,8 +305,10 @@ fn too_costly(at: &At, steps: u64, values: u64) -> FieldFault {
         pointer: "/spec/config".to_owned(),
         code: Code::ValidationFailed,
         detail: format!(
-            "effective configuration of {}: too costly to check: {values} values, for each of which the schema takes up to \
-             {steps} steps, are more than {MAX_WORK} steps; make the configuration smaller or the schema simpler",
+            "effective configuration of {}: too costly to check: {values} values, for each of \
+             which the schema takes up to \
+             {steps} steps, are more than {MAX_WORK} steps; make the configuration smaller or the \
+             schema simpler",
             described(at)
         ),
         document: None,
@@ -294,10 +320,10 @@ pub(super) fn too_many() -> FieldFault {
     FieldFault {
         pointer: String::new(),
         code: Code::ValidationFailed,
-        detail:
-            "the change takes too long to check: make it in parts, or make the schemas or the texts that they match \
+        detail: "the change takes too long to check: make it in parts, or make the schemas or the \
+                 texts that they match \
                  simpler"
-                .to_owned(),
+            .to_owned(),
         document: None,
     }
 }
@@ -308,7 +334,8 @@ fn size_fault(sources: &Sources, at: &At) -> Option<FieldFault> {
         pointer: "/spec/config".to_owned(),
         code: Code::ValidationFailed,
         detail: format!(
-            "effective configuration of {}: {bytes} bytes, at most {MAX_EFFECTIVE_BYTES} are allowed",
+            "effective configuration of {}: {bytes} bytes, at most {MAX_EFFECTIVE_BYTES} are \
+             allowed",
             described(at)
         ),
         document: None,
@@ -384,7 +411,9 @@ pub(super) mod tests {
         let whole = view(&crate::auth::dev::claims());
         let keys = ["Layer/edge".parse().unwrap()];
         let before = State::new(0, []);
-        let faults = |places, deadline| schemas.check_within([&before, &state], &keys, &whole, places, deadline);
+        let faults = |places, deadline| {
+            schemas.check_within([&before, &state], &keys, &whole, places, deadline)
+        };
         // The instances and the service without instance.
         assert_eq!(faults(21, later()), []);
         for refused in [faults(20, later()), faults(21, Instant::now())] {
@@ -421,8 +450,10 @@ pub(super) mod tests {
         // Many faults are not all collected, nor one that tells of many.
         assert_eq!(faults(1000, 9000, json!("x")).len(), 1);
         let choice = json!({ "anyOf": vec![json!({ "items": { "type": "integer" } }); 100] });
-        let refused =
-            faults_of(json!({ "schema": { "properties": { "list": choice } }, "config": { "list": vec!["x"; 1000] } }));
+        let refused = faults_of(json!({
+            "schema": { "properties": { "list": choice } },
+            "config": { "list": vec!["x"; 1000] },
+        }));
         assert!(
             refused.len() == 1 && refused[0].detail.contains("too large together"),
             "{refused:?}"
@@ -435,7 +466,8 @@ pub(super) mod tests {
     fn texts_that_take_long_to_match_are_refused_at_the_deadline() {
         let hostile = json!({ "items": { "not": { "pattern": "(a|b)*a(a|b){300}c$" } } });
         let list = vec!["ab".repeat(1000); 100];
-        let spec = json!({ "schema": { "properties": { "list": hostile } }, "config": { "list": list } });
+        let spec =
+            json!({ "schema": { "properties": { "list": hostile } }, "config": { "list": list } });
         let keys = ["Service/s".parse().unwrap()];
         let whole = view(&crate::auth::dev::claims());
         let faults = |deadline| {
@@ -444,17 +476,19 @@ pub(super) mod tests {
         };
         // It has passed: how fast this machine matches must not decide.
         let refused = faults(Instant::now());
-        assert!(
-            refused.len() == 1 && refused[0].detail.contains("too long"),
-            "{refused:?}"
-        );
+        assert!(refused.len() == 1 && refused[0].detail.contains("too long"), "{refused:?}");
         assert_eq!(faults(later()), []);
     }
 
     #[test]
     fn what_was_too_costly_before_stands_in_nobodys_way() {
         let steps = |count: usize| json!({ "items": { "allOf": vec![json!({ "type": "integer" }); count] } });
-        let service = |schema: Value, items: usize, rate: u64| json!({ "schema": { "properties": { "list": schema } }, "config": { "list": vec![1; items], "rate": rate } });
+        let service = |schema: Value, items: usize, rate: u64| {
+            json!({
+                "schema": { "properties": { "list": schema } },
+                "config": { "list": vec![1; items], "rate": rate },
+            })
+        };
         let before = with_service(service(steps(1000), 11_000, 1));
         assert_eq!(faults_after(&before, service(steps(1000), 11_000, 2)), []);
         let cheap = with_service(service(steps(1000), 1000, 1));
@@ -462,10 +496,7 @@ pub(super) mod tests {
         // Where it could not be seen before it was not checked either.
         let mut unseen = service(steps(1000), 11_000, 1);
         unseen["layers"] = json!([]);
-        assert_eq!(
-            faults_after(&with_service(unseen), service(steps(1000), 11_000, 2)).len(),
-            1
-        );
+        assert_eq!(faults_after(&with_service(unseen), service(steps(1000), 11_000, 2)).len(), 1);
     }
 
     #[test]
@@ -503,12 +534,11 @@ pub(super) mod tests {
                 document("Node/n", node.clone()),
             ],
         );
-        let after = State::new(2, [strict, labelled("Layer/edge", layer), labelled("Node/n", node)]);
+        let after =
+            State::new(2, [strict, labelled("Layer/edge", layer), labelled("Node/n", node)]);
         let faults = |key: &str| {
             let keys = [key.parse().unwrap()];
-            Schemas::default()
-                .check_effective(&before, &after, &keys, &whole, later())
-                .len()
+            Schemas::default().check_effective(&before, &after, &keys, &whole, later()).len()
         };
         assert_eq!((faults("Layer/edge"), faults("Node/n")), (0, 1));
     }

@@ -1,4 +1,5 @@
-//! The one task of a process that writes: it takes what waits, works out all of it on one state and commits it together.
+//! The one task of a process that writes: it takes what waits, works out all of it on one state and
+//! commits it together.
 //!
 //! ```text
 //! queue ─▶ batch ─▶ evaluate each on the state after the ones before ─▶ one transaction ─▶ log ─▶ answers
@@ -6,9 +7,10 @@
 //!            └───────────────── read its commits, evaluate again ◀──────────┘
 //! ```
 //!
-//! Revision n + 1 can be written once only. Its success proves that nobody has committed since n, and so that every check
-//! that was made on the state n was exact, also those that ended in a refusal. A batch that writes nothing has no such
-//! proof; it asks the store for its newest revision before it answers.
+//! Revision n + 1 can be written once only. Its success proves that nobody has committed since n,
+//! and so that every check that was made on the state n was exact, also those that ended in a
+//! refusal. A batch that writes nothing has no such proof; it asks the store for its newest
+//! revision before it answers.
 
 use std::collections::HashSet;
 use std::panic::AssertUnwindSafe;
@@ -26,14 +28,17 @@ use super::evaluate::{Evaluator, Request};
 use super::log::Log;
 use super::report::{AnswerKind, Done};
 use super::view::view;
-use crate::store::{AuditEntry, Change, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError};
+use crate::store::{
+    AuditEntry, Change, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError,
+};
 use blaze_domain::config::state::State;
 
 /// Requests that may wait, at most.
 pub(crate) const QUEUE: usize = 4096;
 /// Requests in one transaction, at most.
 const MAX_BATCH: usize = 256;
-/// Bytes of the bodies of requests that may wait, at most, about: those whose callers have left wait on.
+/// Bytes of the bodies of requests that may wait, at most, about: those whose callers have left
+/// wait on.
 pub(crate) const QUEUE_BYTES: usize = 64 * 1024 * 1024;
 /// Bytes of their bodies, at most, about.
 const MAX_BATCH_BYTES: usize = 4 * 1024 * 1024;
@@ -41,8 +46,8 @@ const MAX_BATCH_BYTES: usize = 4 * 1024 * 1024;
 const QUICK_BYTES: usize = 64 * 1024;
 /// How long one batch is tried.
 const DEADLINE: Duration = Duration::from_secs(10);
-/// How long a batch is worked out before it is written with what there is: while it is, other processes may be first, and
-/// all of it is worked out again.
+/// How long a batch is worked out before it is written with what there is: while it is, other
+/// processes may be first, and all of it is worked out again.
 const SHARE: Duration = Duration::from_millis(100);
 /// Pause before a batch is tried again after another process was first, at most.
 const JITTER: Duration = Duration::from_millis(4);
@@ -72,10 +77,9 @@ pub(crate) struct Running {
 impl Running {
     /// `None` if it is in use already.
     pub(crate) fn begin(keys: &RunningKeys, id: &str) -> Option<Self> {
-        keys.lock().insert(id.to_owned()).then(|| Self {
-            keys: Arc::clone(keys),
-            id: id.to_owned(),
-        })
+        keys.lock()
+            .insert(id.to_owned())
+            .then(|| Self { keys: Arc::clone(keys), id: id.to_owned() })
     }
 }
 
@@ -140,7 +144,11 @@ pub(crate) fn now() -> Timestamp {
 }
 
 /// Reads commits of other processes until the log has `at_least`, or all there are.
-pub(crate) async fn follow(store: &dyn Store, log: &Log, at_least: Option<u64>) -> Result<(), StoreError> {
+pub(crate) async fn follow(
+    store: &dyn Store,
+    log: &Log,
+    at_least: Option<u64>,
+) -> Result<(), StoreError> {
     loop {
         let from = log.revision();
         if at_least.is_some_and(|wanted| from >= wanted) {
@@ -270,8 +278,12 @@ impl Committer {
         }
         let start = self.log.state();
         // Who is told of an answer may read what it speaks of.
-        let is_ahead =
-            |one: &Work| matches!(one.before, Some(Tried::Before(revision, _)) if revision > start.revision());
+        let is_ahead = |one: &Work| {
+            matches!(
+                one.before,
+                Some(Tried::Before(revision, _)) if revision > start.revision(),
+            )
+        };
         if work.iter().any(is_ahead) {
             return Err(Again::Follow);
         }
@@ -282,10 +294,12 @@ impl Committer {
         let (records, tried) = if is_long {
             // Beside the threads that serve, so that they go on meanwhile.
             let (evaluator, start) = (Arc::clone(&self.evaluator), start.clone());
-            let worked = tokio::task::spawn_blocking(move || work_out(&evaluator, &start, work, time)).await;
+            let worked =
+                tokio::task::spawn_blocking(move || work_out(&evaluator, &start, work, time)).await;
             worked.map_err(|error| not_worked_out(&error))?
         } else {
-            // A fault of ours in one change must not end the committer. What it works on is dropped.
+            // A fault of ours in one change must not end the committer. What it works on is
+            // dropped.
             let worked = AssertUnwindSafe(|| work_out(&self.evaluator, &start, work, time));
             std::panic::catch_unwind(worked).map_err(|_| not_worked_out(&"it panicked"))?
         };
@@ -339,7 +353,8 @@ impl Committer {
             if record.body == once.body {
                 Tried::Before(record.revision, record.answer)
             } else {
-                let detail = "the Idempotency-Key was used for a request with another body: use a new key";
+                let detail =
+                    "the Idempotency-Key was used for a request with another body: use a new key";
                 Tried::Refused(Problem::new(Code::IdempotencyKeyReused, detail))
             }
         }))
@@ -365,7 +380,12 @@ impl Work {
 }
 
 /// Works out each request on the state after the ones before, until that has taken [`SHARE`].
-fn work_out(evaluator: &Evaluator, start: &State, work: Vec<Work>, time: Timestamp) -> (Vec<CommitRecord>, Vec<Tried>) {
+fn work_out(
+    evaluator: &Evaluator,
+    start: &State,
+    work: Vec<Work>,
+    time: Timestamp,
+) -> (Vec<CommitRecord>, Vec<Tried>) {
     let id = uuid::Uuid::now_v7().to_string();
     let mut state = start.clone();
     let mut records: Vec<CommitRecord> = Vec::new();
@@ -400,7 +420,14 @@ fn work_out(evaluator: &Evaluator, start: &State, work: Vec<Work>, time: Timesta
                     },
                 };
                 if !done.evaluated.changes.is_empty() {
-                    records.push(record(&one.request, one.answer, one.once.as_ref(), &done, &id, time));
+                    records.push(record(
+                        &one.request,
+                        one.answer,
+                        one.once.as_ref(),
+                        &done,
+                        &id,
+                        time,
+                    ));
                 }
                 tried.push(Tried::Done(Box::new(done)));
             }
@@ -427,7 +454,9 @@ pub(crate) fn unavailable(error: &StoreError) -> Problem {
     tracing::warn!(%error, "the store refused");
     let detail = match error {
         StoreError::Unavailable(_) => "the store cannot be reached; try again",
-        StoreError::Corrupt(_) | StoreError::Refused(_) => "the store cannot be used; see the log of the service",
+        StoreError::Corrupt(_) | StoreError::Refused(_) => {
+            "the store cannot be used; see the log of the service"
+        }
     };
     Problem::new(Code::StoreUnavailable, detail).retry_after(2)
 }
@@ -435,10 +464,9 @@ pub(crate) fn unavailable(error: &StoreError) -> Problem {
 /// The refusal for a store that failed while it wrote.
 pub(crate) fn outcome_unknown(error: &StoreError) -> Problem {
     tracing::warn!(%error, "the outcome of a write is not known");
-    let detail = "the store went away while it wrote: read what is there to see whether it took effect";
-    Problem::new(Code::OutcomeUnknown, detail)
-        .applied(Applied::Unknown)
-        .retry_after(2)
+    let detail =
+        "the store went away while it wrote: read what is there to see whether it took effect";
+    Problem::new(Code::OutcomeUnknown, detail).applied(Applied::Unknown).retry_after(2)
 }
 
 fn answer(batch: Vec<Queued>, tried: Vec<Tried>) {

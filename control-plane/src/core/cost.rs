@@ -6,8 +6,9 @@
 //! configuration ─▶ values in it ──┘
 //! ```
 //!
-//! References make the bound necessary: thirty definitions that each refer twice to the next one take 2^30 steps. What
-//! matching texts takes is left to the deadline of a check, see [`super::pattern`].
+//! References make the bound necessary: thirty definitions that each refer twice to the next one
+//! take 2^30 steps. What matching texts takes is left to the deadline of a check, see
+//! [`super::pattern`].
 
 use std::collections::HashMap;
 
@@ -16,7 +17,8 @@ use serde_json::{Map, Value};
 
 use super::schema::{ONE, find_anchors, own_dialect, resolve};
 
-/// Subschemas that may be visited on the way to one leaf of a configuration. References that meet again multiply them.
+/// Subschemas that may be visited on the way to one leaf of a configuration. References that meet
+/// again multiply them.
 const MAX_STEPS: u64 = 10_000;
 /// Subschemas within each other: each takes a part of the stack.
 const MAX_NESTING: usize = 512;
@@ -28,7 +30,8 @@ const NAMES_PER_STEP: usize = 10;
 const BYTES_PER_VALUE: usize = 100;
 /// Steps that may be needed for one effective configuration: about half a second.
 pub(super) const MAX_WORK: u64 = 10_000_000;
-/// The same up to which the places of the faults are given: one fault of a choice lists those of each alternative.
+/// The same up to which the places of the faults are given: one fault of a choice lists those of
+/// each alternative.
 pub(super) const MAX_WORK_OF_FAULTS: u64 = 50_000;
 
 /// Values in a configuration. A long text counts as several.
@@ -38,7 +41,9 @@ pub(super) fn values(config: &Value) -> u64 {
         Value::Null | Value::Bool(_) | Value::Number(_) => 0,
         Value::String(found) => text(found),
         Value::Array(items) => items.iter().map(values).sum(),
-        Value::Object(members) => members.iter().map(|(name, member)| text(name) + values(member)).sum(),
+        Value::Object(members) => {
+            members.iter().map(|(name, member)| text(name) + values(member)).sum()
+        }
     }
 }
 
@@ -49,11 +54,7 @@ pub(super) fn values(config: &Value) -> u64 {
 pub(super) fn steps(schema: &Value) -> Result<u64, String> {
     let mut anchors = HashMap::new();
     find_anchors(schema, true, &mut anchors)?;
-    let mut bound = Bound {
-        root: schema,
-        anchors,
-        known: HashMap::new(),
-    };
+    let mut bound = Bound { root: schema, anchors, known: HashMap::new() };
     Ok(bound.effort(schema, MAX_DEPTH, 1)?.steps)
 }
 
@@ -75,22 +76,25 @@ impl Effort {
 
     /// One of the subschemas is visited.
     fn or(self, other: Self) -> Self {
-        Self {
-            steps: self.steps.max(other.steps),
-            nesting: self.nesting.max(other.nesting),
-        }
+        Self { steps: self.steps.max(other.steps), nesting: self.nesting.max(other.nesting) }
     }
 }
 
 struct Bound<'s> {
     root: &'s Value,
     anchors: HashMap<&'s str, &'s Value>,
-    /// By subschema and by the levels of the configuration that may still come. `None` while it is being computed.
+    /// By subschema and by the levels of the configuration that may still come. `None` while it is
+    /// being computed.
     known: HashMap<(*const Value, usize), Option<Effort>>,
 }
 
 impl<'s> Bound<'s> {
-    fn effort(&mut self, schema: &'s Value, levels: usize, nesting: usize) -> Result<Effort, String> {
+    fn effort(
+        &mut self,
+        schema: &'s Value,
+        levels: usize,
+        nesting: usize,
+    ) -> Result<Effort, String> {
         let Value::Object(members) = schema else {
             return Ok(Effort { steps: 1, nesting: 1 });
         };
@@ -113,7 +117,8 @@ impl<'s> Bound<'s> {
                 within = within.and(self.within_value(name, value, levels, nesting + 1)?);
             }
         }
-        if members.contains_key("unevaluatedProperties") || members.contains_key("unevaluatedItems") {
+        if members.contains_key("unevaluatedProperties") || members.contains_key("unevaluatedItems")
+        {
             // To know what is left over, everything is visited once more.
             same = same.and(same);
         }
@@ -128,26 +133,47 @@ impl<'s> Bound<'s> {
     }
 
     /// What a keyword visits for the same value.
-    fn same_value(&mut self, name: &str, value: &'s Value, levels: usize, nesting: usize) -> Result<Effort, String> {
+    fn same_value(
+        &mut self,
+        name: &str,
+        value: &'s Value,
+        levels: usize,
+        nesting: usize,
+    ) -> Result<Effort, String> {
         match (name, value) {
-            ("$ref" | "$dynamicRef", Value::String(reference)) => self.referred(reference, levels, nesting),
+            ("$ref" | "$dynamicRef", Value::String(reference)) => {
+                self.referred(reference, levels, nesting)
+            }
             ("not" | "if" | "then" | "else", value) => self.effort(value, levels, nesting),
             ("allOf" | "anyOf" | "oneOf", Value::Array(list)) => self.all(list, levels, nesting),
             // The second one is of an older dialect, and applied all the same.
-            ("dependentSchemas" | "dependencies", Value::Object(named)) => self.all(named.values(), levels, nesting),
+            ("dependentSchemas" | "dependencies", Value::Object(named)) => {
+                self.all(named.values(), levels, nesting)
+            }
             _ => Ok(Effort::default()),
         }
     }
 
-    /// What a keyword visits for the members and items of the value, of which so many levels may still come.
-    fn within_value(&mut self, name: &str, value: &'s Value, levels: usize, nesting: usize) -> Result<Effort, String> {
+    /// What a keyword visits for the members and items of the value, of which so many levels may
+    /// still come.
+    fn within_value(
+        &mut self,
+        name: &str,
+        value: &'s Value,
+        levels: usize,
+        nesting: usize,
+    ) -> Result<Effort, String> {
         match (name, value) {
             // A member has one name, and an item one place.
             ("properties", Value::Object(named)) => self.any(named.values(), levels, nesting),
             ("prefixItems", Value::Array(list)) => self.any(list, levels, nesting),
-            ("patternProperties", Value::Object(named)) => self.all(named.values(), levels, nesting),
+            ("patternProperties", Value::Object(named)) => {
+                self.all(named.values(), levels, nesting)
+            }
             ("not" | "if" | "then" | "else", _) => Ok(Effort::default()),
-            (name, value) if ONE.contains(&name) || name == "additionalItems" => self.effort(value, levels, nesting),
+            (name, value) if ONE.contains(&name) || name == "additionalItems" => {
+                self.effort(value, levels, nesting)
+            }
             _ => Ok(Effort::default()),
         }
     }
@@ -158,9 +184,9 @@ impl<'s> Bound<'s> {
         levels: usize,
         nesting: usize,
     ) -> Result<Effort, String> {
-        schemas.into_iter().try_fold(Effort::default(), |sum, one| {
-            Ok(sum.and(self.effort(one, levels, nesting)?))
-        })
+        schemas
+            .into_iter()
+            .try_fold(Effort::default(), |sum, one| Ok(sum.and(self.effort(one, levels, nesting)?)))
     }
 
     fn any(
@@ -174,8 +200,14 @@ impl<'s> Bound<'s> {
         })
     }
 
-    /// What a reference leads to. A subschema that leads back to itself at the same value has no bound.
-    fn referred(&mut self, reference: &str, levels: usize, nesting: usize) -> Result<Effort, String> {
+    /// What a reference leads to. A subschema that leads back to itself at the same value has no
+    /// bound.
+    fn referred(
+        &mut self,
+        reference: &str,
+        levels: usize,
+        nesting: usize,
+    ) -> Result<Effort, String> {
         let target = resolve(self.root, &self.anchors, reference);
         let target = target.filter(|target| target.is_object() || target.is_boolean());
         let target = target.ok_or_else(|| {
@@ -184,7 +216,8 @@ impl<'s> Bound<'s> {
         })?;
         if let Some(None) = self.known.get(&(std::ptr::from_ref(target), levels)) {
             return Err(format!(
-                "$ref {reference:?} leads back to itself at the same value; a schema may refer to itself only for what is \
+                "$ref {reference:?} leads back to itself at the same value; a schema may refer to \
+                 itself only for what is \
                  within the value: below properties, items or the like"
             ));
         }
@@ -192,10 +225,13 @@ impl<'s> Bound<'s> {
     }
 }
 
-/// Steps of a subschema without those within it: lists of names or values are gone through, and patterns are matched.
+/// Steps of a subschema without those within it: lists of names or values are gone through, and
+/// patterns are matched.
 fn own_steps(members: &Map<String, Value>) -> u64 {
     let one = |(name, value): (&String, &Value)| match (name.as_str(), value) {
-        ("patternProperties", Value::Object(named)) => PATTERN_STEPS.saturating_mul(named.len() as u64),
+        ("patternProperties", Value::Object(named)) => {
+            PATTERN_STEPS.saturating_mul(named.len() as u64)
+        }
         ("pattern", _) => PATTERN_STEPS,
         (_, Value::Array(list)) => (list.len() / NAMES_PER_STEP) as u64,
         (_, Value::Object(named)) => (named.len() / NAMES_PER_STEP) as u64,
@@ -206,7 +242,8 @@ fn own_steps(members: &Map<String, Value>) -> u64 {
 
 fn too_much() -> String {
     format!(
-        "its references meet again and again: more than {MAX_STEPS} subschemas for one value, or {MAX_NESTING} within \
+        "its references meet again and again: more than {MAX_STEPS} subschemas for one value, or \
+         {MAX_NESTING} within \
          each other"
     )
 }
@@ -237,7 +274,10 @@ mod tests {
 
     #[test]
     fn dependencies_of_the_older_dialects_count() {
-        let twice = |target: String| json!({ "dependencies": { "a": { "$ref": target }, "b": { "$ref": target } } });
+        let twice = |target: String| {
+            json!({ "dependencies": { "a": { "$ref": target },
+            "b": { "$ref": target } } })
+        };
         let mut defs: Map<String, Value> = (0..30)
             .map(|number| (format!("d{number}"), twice(format!("#/$defs/d{}", number + 1))))
             .collect();
@@ -258,14 +298,12 @@ mod tests {
         refused(&json!({ "not": { "$ref": "#" } }));
         refused(&json!({ "dependencies": { "a": { "$ref": "#" } } }));
         refused(&json!({ "$anchor": "top", "anyOf": [true, { "$dynamicRef": "#top" }] }));
-        // Each level refers to all of its own and to the next, so that it seems cheap as long as it is not known.
+        // Each level refers to all of its own and to the next, so that it seems cheap as long as it
+        // is not known.
         let level = |number: usize| {
             let own = (0..30).map(|_| json!({ "$ref": format!("#/$defs/l{number}") }));
             let next = (0..30).map(|_| json!({ "$ref": format!("#/$defs/l{}", number + 1) }));
-            (
-                format!("l{number}"),
-                json!({ "anyOf": own.chain(next).collect::<Vec<Value>>() }),
-            )
+            (format!("l{number}"), json!({ "anyOf": own.chain(next).collect::<Vec<Value>>() }))
         };
         let mut defs: Map<String, Value> = (0..10).map(level).collect();
         defs.insert("l10".to_owned(), json!(true));
@@ -277,7 +315,8 @@ mod tests {
         // A validator decodes it, and would come to the other one.
         let defs = json!({ "a%25b": true, "a%b": { "type": "string" } });
         assert!(steps(&json!({ "$ref": "#/$defs/a%25b", "$defs": defs })).is_err());
-        let anchors = json!({ "one": { "$anchor": "a" }, "two": { "$anchor": "a", "type": "string" } });
+        let anchors =
+            json!({ "one": { "$anchor": "a" }, "two": { "$anchor": "a", "type": "string" } });
         let error = steps(&json!({ "$ref": "#a", "$defs": anchors })).unwrap_err();
         assert!(error.contains("twice"), "{error}");
     }

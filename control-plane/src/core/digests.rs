@@ -1,4 +1,5 @@
-//! Digests of what layers see, remembered: workers of one layer ask for the same ones at the same time.
+//! Digests of what layers see, remembered: workers of one layer ask for the same ones at the same
+//! time.
 
 use std::num::NonZeroUsize;
 
@@ -18,14 +19,13 @@ pub(crate) struct Digests {
 
 impl Default for Digests {
     fn default() -> Self {
-        Self {
-            known: Mutex::new(LruCache::new(REMEMBERED)),
-        }
+        Self { known: Mutex::new(LruCache::new(REMEMBERED)) }
     }
 }
 
 impl Digests {
-    /// Digest of what a layer sees in a state. The state must be one of this store: its revision stands for it.
+    /// Digest of what a layer sees in a state. The state must be one of this store: its revision
+    /// stands for it.
     pub(crate) fn of(&self, state: &State, layer: &LayerName) -> String {
         let key = (layer.clone(), state.revision());
         if let Some(known) = self.known.lock().get(&key) {

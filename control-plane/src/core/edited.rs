@@ -8,8 +8,9 @@
 //!                                                                                          alone went away
 //! ```
 //!
-//! "The same place" means something only in a list that is as long as it was and in which nothing moved. In doubt nobody is
-//! meant: the secret of one item must not come to stand beside the members of another.
+//! "The same place" means something only in a list that is as long as it was and in which nothing
+//! moved. In doubt nobody is meant: the secret of one item must not come to stand beside the
+//! members of another.
 
 use std::collections::{HashMap, HashSet};
 
@@ -40,8 +41,14 @@ pub(super) struct Edited {
 }
 
 impl Edited {
-    /// Of a list as it is now with indices of items that are not written as they were, and of what is written instead.
-    pub(super) fn new(current: &[Value], left: HashSet<usize>, changed: &[&Value], is_in_place: bool) -> Self {
+    /// Of a list as it is now with indices of items that are not written as they were, and of what
+    /// is written instead.
+    pub(super) fn new(
+        current: &[Value],
+        left: HashSet<usize>,
+        changed: &[&Value],
+        is_in_place: bool,
+    ) -> Self {
         let keeping = changed.iter().filter(|item| !kept(item).is_empty()).count();
         let mut out = Self {
             marks: Vec::new(),
@@ -83,14 +90,14 @@ impl Edited {
         if wanted.is_empty() {
             return here;
         }
-        let rarest = wanted
-            .iter()
-            .map(|mark| self.marked.get(mark).map_or(&[][..], Vec::as_slice));
+        let rarest = wanted.iter().map(|mark| self.marked.get(mark).map_or(&[][..], Vec::as_slice));
         let rarest = rarest.min_by_key(|found| found.len()).unwrap_or_default();
-        let is_match = |place: usize| self.marks.get(place).is_some_and(|marks| covers(marks, &wanted));
+        let is_match =
+            |place: usize| self.marks.get(place).is_some_and(|marks| covers(marks, &wanted));
         if rarest.len() <= FEW {
             let all: Vec<usize> = rarest.iter().copied().filter(|place| is_match(*place)).collect();
-            let left: Vec<usize> = all.iter().copied().filter(|place| self.left.contains(place)).collect();
+            let left: Vec<usize> =
+                all.iter().copied().filter(|place| self.left.contains(place)).collect();
             match (all.as_slice(), left.as_slice()) {
                 // An older version: it is known by its place alone.
                 ([], _) => return here.filter(|_| self.left.len() == 1),
@@ -104,7 +111,8 @@ impl Edited {
         self.is_nearest(item, here).then_some(here)
     }
 
-    /// Whether no other item that went away is more like it; or, where items were replaced, each other is less like it.
+    /// Whether no other item that went away is more like it; or, where items were replaced, each
+    /// other is less like it.
     fn is_nearest(&self, item: &Value, here: usize) -> bool {
         let mut common: HashMap<usize, usize> = HashMap::new();
         let found = members(item).into_iter().filter_map(|member| self.members.get(&member));

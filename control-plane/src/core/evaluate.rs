@@ -1,5 +1,6 @@
-//! From a request and a state to changes, or to a refusal. Pure but for new uids, nonces and the deadline of the checks:
-//! the same code runs for a dry run, for the first try and again after another process was first.
+//! From a request and a state to changes, or to a refusal. Pure but for new uids, nonces and the
+//! deadline of the checks: the same code runs for a dry run, for the first try and again after
+//! another process was first.
 
 mod faults;
 mod outcome;
@@ -11,7 +12,9 @@ use std::time::Instant;
 use blaze_domain::NodeName;
 use blaze_domain::config::diff::{document_diff, paths};
 use blaze_domain::config::selector::LabelSelector;
-use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_DOCUMENTS, Problem, Timestamp, secret};
+use blaze_domain::config::{
+    Code, Document, FieldFault, Key, Kind, MAX_DOCUMENTS, Problem, Timestamp, secret,
+};
 use serde_json::Value;
 
 pub(super) use self::faults::invalid;
@@ -111,7 +114,8 @@ pub(crate) struct Request {
     /// Deletes also what refers to what is deleted.
     pub(crate) cascade: bool,
     pub(crate) prune: Option<Prune>,
-    /// Documents changed since are a conflict (`revert`): key and revision that each must still have.
+    /// Documents changed since are a conflict (`revert`): key and revision that each must still
+    /// have.
     pub(crate) unchanged_since: BTreeMap<Key, u64>,
 }
 
@@ -123,7 +127,9 @@ impl Request {
             (Content::Write(input), Kind::Rollout) => {
                 is_set(input.spec.get("patch").and_then(|patch| patch.get("schema")))
             }
-            (Content::Patch(patch), Kind::Service) => is_set(patch.get("spec").and_then(|spec| spec.get("schema"))),
+            (Content::Patch(patch), Kind::Service) => {
+                is_set(patch.get("spec").and_then(|spec| spec.get("schema")))
+            }
             (Content::Restore(_), Kind::Service) | (Content::Promote, _) => true,
             (
                 Content::Write(_)
@@ -155,7 +161,8 @@ pub(crate) struct Evaluator {
 }
 
 impl Evaluator {
-    /// Works out what a request changes. `revision` and `time` are those of the commit that it would become.
+    /// Works out what a request changes. `revision` and `time` are those of the commit that it
+    /// would become.
     pub(crate) fn evaluate(
         &self,
         state: &State,
@@ -223,14 +230,24 @@ impl Evaluator {
             let before = state.get(&key).map(|held| Arc::clone(&held.document));
             let change = match outcome {
                 Outcome::Keep => None,
-                Outcome::Remove => before
-                    .as_ref()
-                    .map(|document| removal(document, revision, time, request)),
+                Outcome::Remove => {
+                    before.as_ref().map(|document| removal(document, revision, time, request))
+                }
                 Outcome::Put(target) => {
-                    match self.document(&key, before.as_deref(), *target, revision, time, request, deadline) {
+                    match self.document(
+                        &key,
+                        before.as_deref(),
+                        *target,
+                        revision,
+                        time,
+                        request,
+                        deadline,
+                    ) {
                         Ok(Some(document)) => {
-                            // What is written anyway leaves old keys behind, so that they can be taken away one day.
-                            let document = self.keyring.reseal(&document).ok().flatten().unwrap_or(document);
+                            // What is written anyway leaves old keys behind, so that they can be
+                            // taken away one day.
+                            let document =
+                                self.keyring.reseal(&document).ok().flatten().unwrap_or(document);
                             Some(put(before.as_deref(), document, op))
                         }
                         Ok(None) => None,
@@ -241,7 +258,8 @@ impl Evaluator {
                     }
                 }
             };
-            let action = match change.as_ref().map(|change: &Change| (change.op, before.is_some())) {
+            let action = match change.as_ref().map(|change: &Change| (change.op, before.is_some()))
+            {
                 None => ApplyAction::Unchanged,
                 Some((Op::Delete, _)) => ApplyAction::Deleted,
                 Some((_, true)) => ApplyAction::Updated,
@@ -260,10 +278,7 @@ impl Evaluator {
             let action = actions.get(&key).copied().unwrap_or(ApplyAction::Unchanged);
             (key, action)
         });
-        Ok(Evaluated {
-            results: results.collect(),
-            changes,
-        })
+        Ok(Evaluated { results: results.collect(), changes })
     }
 
     /// The document that is stored; `None` if nothing changes.
@@ -278,7 +293,8 @@ impl Evaluator {
         request: &Request,
         deadline: Instant,
     ) -> Result<Option<Document>, Vec<FieldFault>> {
-        let uid = before.map_or_else(|| uuid::Uuid::now_v7().to_string(), |document| document.uid.clone());
+        let uid = before
+            .map_or_else(|| uuid::Uuid::now_v7().to_string(), |document| document.uid.clone());
         let mut spec = target.spec;
         if key.kind() == Kind::Rollout && secret::contains(&spec) {
             return Err(vec![invalid(
@@ -298,11 +314,11 @@ impl Evaluator {
         let stored = before.and_then(|before| before.spec_member("schema"));
         if key.kind() == Kind::Service
             && let Some(schema) = spec.get("schema").filter(|schema| !schema.is_null())
-            // One that is stored was sound when it came, and does not stand in the way of other changes.
+            // One that is stored was sound when it came, and does not stand in the way of other
+            // changes.
             && stored != Some(schema)
         {
-            self.check_schema(schema, "/spec/schema", deadline)
-                .map_err(|fault| vec![fault])?;
+            self.check_schema(schema, "/spec/schema", deadline).map_err(|fault| vec![fault])?;
         }
         if let Some(before) = before
             && before.labels == target.labels
@@ -327,14 +343,20 @@ impl Evaluator {
     }
 
     /// Whether a schema is sound.
-    fn check_schema(&self, schema: &Value, pointer: &str, deadline: Instant) -> Result<(), FieldFault> {
+    fn check_schema(
+        &self,
+        schema: &Value,
+        pointer: &str,
+        deadline: Instant,
+    ) -> Result<(), FieldFault> {
         if Instant::now() >= deadline {
             return Err(too_many());
         }
         self.schemas.check(schema).map_err(|reason| invalid(pointer, &reason))
     }
 
-    /// Judges roll-outs that begin by what there is after the change, of which their targets and nodes may be part.
+    /// Judges roll-outs that begin by what there is after the change, of which their targets and
+    /// nodes may be part.
     fn begin_rollouts(
         &self,
         after: &mut State,
@@ -359,8 +381,12 @@ impl Evaluator {
             if let Some((target, patched)) = tried(after, &rollout) {
                 let state: &State = after;
                 let written = view.check_write((state, Some(&target)), (state, Some(&patched)));
-                written.map_err(|_| view.outside(&format!("what {} makes of its target", rollout.key)))?;
-                for fault in self.faults_of_tried(state, &rollout, &patched, faults.room(), deadline) {
+                written.map_err(|_| {
+                    view.outside(&format!("what {} makes of its target", rollout.key))
+                })?;
+                for fault in
+                    self.faults_of_tried(state, &rollout, &patched, faults.room(), deadline)
+                {
                     faults.add(index, fault);
                 }
             }
@@ -372,7 +398,8 @@ impl Evaluator {
         Ok(())
     }
 
-    /// What is wrong with what a roll-out makes of its target: references, and a schema that it brings.
+    /// What is wrong with what a roll-out makes of its target: references, and a schema that it
+    /// brings.
     fn faults_of_tried(
         &self,
         after: &State,
@@ -450,13 +477,20 @@ impl Evaluator {
     }
 }
 
-/// Whether a change is a roll-out that begins. One that exists does not, but who makes it learns first what is wrong with it.
+/// Whether a change is a roll-out that begins. One that exists does not, but who makes it learns
+/// first what is wrong with it.
 fn begins(request: &Request, change: &Change) -> bool {
-    change.document.key.kind() == Kind::Rollout && (change.op == Op::Create || request.form == Form::Create)
+    change.document.key.kind() == Kind::Rollout
+        && (change.op == Op::Create || request.form == Form::Create)
 }
 
 /// Refuses changes that a bound token may not make, before anything else is told of them.
-fn check_rights(before: &State, after: &State, request: &Request, changes: &[Change]) -> Result<(), Problem> {
+fn check_rights(
+    before: &State,
+    after: &State,
+    request: &Request,
+    changes: &[Change],
+) -> Result<(), Problem> {
     let view = view(&request.caller.claims);
     let document = |state: &State, key: &Key| state.get(key).map(|held| Arc::clone(&held.document));
     for change in changes {

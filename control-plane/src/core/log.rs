@@ -1,4 +1,5 @@
-//! The newest state, and the commits that led to it: bounded, for watchers and for reading a little way back.
+//! The newest state, and the commits that led to it: bounded, for watchers and for reading a little
+//! way back.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, OnceLock};
@@ -49,12 +50,7 @@ impl Log {
     pub(crate) fn new(state: State, floor: u64) -> Self {
         Self {
             head: watch::Sender::new(state.revision()),
-            inner: RwLock::new(Inner {
-                state,
-                floor,
-                commits: VecDeque::new(),
-                bytes: 0,
-            }),
+            inner: RwLock::new(Inner { state, floor, commits: VecDeque::new(), bytes: 0 }),
         }
     }
 
@@ -78,13 +74,15 @@ impl Log {
         self.inner.read().floor
     }
 
-    /// Raises the floor. What is in memory stays: a watch that began above the old floor still gets all of it.
+    /// Raises the floor. What is in memory stays: a watch that began above the old floor still gets
+    /// all of it.
     pub(crate) fn raise_floor(&self, floor: u64) {
         let mut inner = self.inner.write();
         inner.floor = inner.floor.max(floor);
     }
 
-    /// Applies the next commit; one that is there already changes nothing. `false` if one before it is missing.
+    /// Applies the next commit; one that is there already changes nothing. `false` if one before it
+    /// is missing.
     pub(crate) fn append(&self, commit: Arc<Commit>) -> bool {
         let mut inner = self.inner.write();
         let next = inner.state.revision() + 1;
@@ -94,12 +92,9 @@ impl Log {
         if commit.revision > next {
             return false;
         }
-        let originals = inner
-            .state
-            .originals(commit.changes.iter().map(|change| &change.document.key));
-        let effects = inner
-            .state
-            .apply(commit.revision, commit.changes.iter().map(Change::step));
+        let originals =
+            inner.state.originals(commit.changes.iter().map(|change| &change.document.key));
+        let effects = inner.state.apply(commit.revision, commit.changes.iter().map(Change::step));
         let bytes = commit_bytes(&commit);
         inner.bytes += bytes;
         inner.commits.push_back(Arc::new(Applied {
@@ -109,7 +104,9 @@ impl Log {
             bytes,
             unfiltered: OnceLock::new(),
         }));
-        while inner.commits.len() > MAX_COMMITS || (inner.bytes > MAX_BYTES && inner.commits.len() > 1) {
+        while inner.commits.len() > MAX_COMMITS
+            || (inner.bytes > MAX_BYTES && inner.commits.len() > 1)
+        {
             inner.drop_oldest();
         }
         drop(inner);
@@ -117,20 +114,15 @@ impl Log {
         true
     }
 
-    /// Starts anew from what the store has, when commits in between cannot be had any more. Never goes back: another
-    /// task may have come further meanwhile.
+    /// Starts anew from what the store has, when commits in between cannot be had any more. Never
+    /// goes back: another task may have come further meanwhile.
     pub(crate) fn reset(&self, state: State, floor: u64) {
         let mut inner = self.inner.write();
         let revision = state.revision();
         if revision <= inner.state.revision() {
             return;
         }
-        *inner = Inner {
-            state,
-            floor,
-            commits: VecDeque::new(),
-            bytes: 0,
-        };
+        *inner = Inner { state, floor, commits: VecDeque::new(), bytes: 0 };
         drop(inner);
         self.head.send_replace(revision);
     }
@@ -160,11 +152,8 @@ impl Log {
             if revision + 1 < first {
                 return None;
             }
-            let newer = inner
-                .commits
-                .iter()
-                .rev()
-                .take_while(|applied| applied.commit.revision > revision);
+            let newer =
+                inner.commits.iter().rev().take_while(|applied| applied.commit.revision > revision);
             (inner.state.clone(), newer.cloned().collect::<Vec<_>>())
         };
         for applied in commits {

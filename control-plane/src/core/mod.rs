@@ -1,4 +1,5 @@
-//! The use cases of the main service: pure rules in the middle, one committer, a log of recent commits.
+//! The use cases of the main service: pure rules in the middle, one committer, a log of recent
+//! commits.
 //!
 //! ```text
 //! REST, gRPC ─▶ service ─▶ queue ─▶ committer ─[evaluate: state + request → changes]─▶ Store::commit ─▶ state, log ─▶ watch
@@ -33,7 +34,8 @@ mod workers;
 
 pub use committer::{CommitReport, OnCommit};
 pub use service::{
-    ConfigService, CoreOptions, DiffReport, OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream,
+    ConfigService, CoreOptions, DiffReport, OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL, SyncHello,
+    SyncItem, SyncStream,
 };
 pub use types::*;
 pub use watch::WatchStream;

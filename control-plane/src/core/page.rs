@@ -29,12 +29,11 @@ pub(crate) struct Pages {
 impl Pages {
     pub(crate) fn new(store_id: &str) -> Self {
         let secret = Sha256::digest(format!("page tokens of {store_id}").as_bytes());
-        Self {
-            key: hmac::Key::new(hmac::HMAC_SHA256, &secret),
-        }
+        Self { key: hmac::Key::new(hmac::HMAC_SHA256, &secret) }
     }
 
-    /// The token for what comes after a position; `query` is everything that the next request must repeat.
+    /// The token for what comes after a position; `query` is everything that the next request must
+    /// repeat.
     pub(crate) fn token(&self, query: &str, position: &Position) -> String {
         let body = json!([position.revision, position.after]).to_string();
         let tag = self.tag(query, &body);
@@ -61,14 +60,8 @@ impl Pages {
             return Err(refuse());
         }
         let value: Value = serde_json::from_str(body).map_err(|_| refuse())?;
-        match (
-            value.get(0).and_then(Value::as_u64),
-            value.get(1).and_then(Value::as_str),
-        ) {
-            (Some(revision), Some(after)) => Ok(Position {
-                revision,
-                after: after.to_owned(),
-            }),
+        match (value.get(0).and_then(Value::as_u64), value.get(1).and_then(Value::as_str)) {
+            (Some(revision), Some(after)) => Ok(Position { revision, after: after.to_owned() }),
             _ => Err(refuse()),
         }
     }
@@ -89,10 +82,7 @@ mod tests {
     #[test]
     fn a_token_is_good_for_its_query_alone() {
         let pages = Pages::new("a");
-        let position = Position {
-            revision: 7,
-            after: "Node/robot-1".to_owned(),
-        };
+        let position = Position { revision: 7, after: "Node/robot-1".to_owned() };
         let token = pages.token("nodes", &position);
         assert_eq!(pages.position("nodes", &token).unwrap(), position);
         assert!(pages.position("layers", &token).is_err());

@@ -1,8 +1,10 @@
-//! Keywords of a schema that look at a text: `pattern`, `minLength` and `maxLength`. They wrap those of the library for
-//! two reasons.
+//! Keywords of a schema that look at a text: `pattern`, `minLength` and `maxLength`. They wrap
+//! those of the library for two reasons.
 //!
-//! - Of a secret nothing may be told, so they hold at what stands in its place: see [`placeholder`].
-//! - Matching is linear in the text, but a text may be long and a pattern large: it ends at a deadline, see [`within`].
+//! - Of a secret nothing may be told, so they hold at what stands in its place: see
+//!   [`placeholder`].
+//! - Matching is linear in the text, but a text may be long and a pattern large: it ends at a
+//!   deadline, see [`within`].
 
 use std::cell::Cell;
 use std::sync::LazyLock;
@@ -28,7 +30,8 @@ pub(super) fn placeholder(number: usize) -> Value {
     Value::from(format!("{} {number}", *PLACEHOLDER))
 }
 
-/// Does a check in which no text is matched after a deadline; `None`: it came, so that the result would mean nothing.
+/// Does a check in which no text is matched after a deadline; `None`: it came, so that the result
+/// would mean nothing.
 pub(super) fn within<T>(deadline: Instant, check: impl FnOnce() -> T) -> Option<T> {
     DEADLINE.set(Some(deadline));
     let out = check();
@@ -38,9 +41,7 @@ pub(super) fn within<T>(deadline: Instant, check: impl FnOnce() -> T) -> Option<
 
 /// The engine that takes time linear in the text.
 pub(super) fn options() -> PatternOptions<Regex> {
-    PatternOptions::regex()
-        .size_limit(MAX_BYTES)
-        .dfa_size_limit(CACHE_BYTES)
+    PatternOptions::regex().size_limit(MAX_BYTES).dfa_size_limit(CACHE_BYTES)
 }
 
 /// A keyword about texts, beyond what stands for a secret.
@@ -48,7 +49,10 @@ struct OfText(Validator);
 
 /// Wraps the keyword `name`.
 #[allow(clippy::result_large_err, reason = "the form of jsonschema")]
-pub(super) fn keyword<'a>(name: &str, schema: &'a Value) -> Result<Box<dyn for<'i> Keyword<'i>>, ValidationError<'a>> {
+pub(super) fn keyword<'a>(
+    name: &str,
+    schema: &'a Value,
+) -> Result<Box<dyn for<'i> Keyword<'i>>, ValidationError<'a>> {
     let built = jsonschema::options()
         .with_draft(jsonschema::Draft::Draft202012)
         .with_pattern_options(options())
@@ -56,7 +60,8 @@ pub(super) fn keyword<'a>(name: &str, schema: &'a Value) -> Result<Box<dyn for<'
         .build(&json!({ name: schema }));
     let wrong = |_| {
         ValidationError::custom(format!(
-            "{name} {schema} cannot be used: it is no regular expression (look-around and back-references are not part of \
+            "{name} {schema} cannot be used: it is no regular expression (look-around and \
+             back-references are not part of \
              what is understood), or takes more than {MAX_BYTES} bytes, compiled"
         ))
     };
@@ -65,9 +70,7 @@ pub(super) fn keyword<'a>(name: &str, schema: &'a Value) -> Result<Box<dyn for<'
 
 impl OfText {
     fn is_left_out(instance: &Value) -> bool {
-        instance
-            .as_str()
-            .is_none_or(|text| text.starts_with(PLACEHOLDER.as_str()))
+        instance.as_str().is_none_or(|text| text.starts_with(PLACEHOLDER.as_str()))
             || DEADLINE.get().is_some_and(|deadline| Instant::now() >= deadline)
     }
 }
@@ -106,11 +109,7 @@ mod tests {
             (json!({ "minLength": 1, "maxLength": 2 }), "äöü", false),
             (json!({ "pattern": "b+" }), "abbc", true),
             (json!({ "pattern": "^b+$" }), "abbc", false),
-            (
-                json!({ "pattern": "^\\d\\w\\s\\cA\\u0041\\p{Lu}\\/$" }),
-                "1_ \u{1}AÄ/",
-                true,
-            ),
+            (json!({ "pattern": "^\\d\\w\\s\\cA\\u0041\\p{Lu}\\/$" }), "1_ \u{1}AÄ/", true),
             // As ECMAScript reads them: ASCII digits alone.
             (json!({ "pattern": "^\\d$" }), "٣", false),
             (json!({ "propertyNames": { "pattern": "^a" } }), "no object", true),
@@ -118,10 +117,7 @@ mod tests {
             assert_eq!(is_valid(&schema, &json!(text)), expected, "{schema} {text:?}");
         }
         for no_text in [json!(7), json!([]), json!(null)] {
-            assert!(is_valid(
-                &json!({ "minLength": 3, "maxLength": 0, "pattern": "a" }),
-                &no_text
-            ));
+            assert!(is_valid(&json!({ "minLength": 3, "maxLength": 0, "pattern": "a" }), &no_text));
         }
         let names = json!({ "propertyNames": { "pattern": "^a" } });
         assert!(is_valid(&names, &json!({ "ab": 1 })) && !is_valid(&names, &json!({ "b": 1 })));

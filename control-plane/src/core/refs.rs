@@ -7,10 +7,7 @@ use blaze_domain::config::state::State;
 
 /// References of a document to what does not exist, at most so many.
 pub(crate) fn missing(state: &State, key: &Key, most: usize) -> Vec<FieldFault> {
-    state
-        .get(key)
-        .map(|held| missing_of(state, &held.document, most))
-        .unwrap_or_default()
+    state.get(key).map(|held| missing_of(state, &held.document, most)).unwrap_or_default()
 }
 
 /// The same of a document that need not be part of the state.
@@ -45,8 +42,8 @@ fn suggestion(state: &State, target: &Key) -> String {
     }
 }
 
-/// Documents that refer to one, in the order of their keys; at most `limit`. A roll-out that has ended is history and
-/// holds nobody back.
+/// Documents that refer to one, in the order of their keys; at most `limit`. A roll-out that has
+/// ended is history and holds nobody back.
 pub(crate) fn referrers(state: &State, key: &Key, limit: usize) -> Vec<Key> {
     let mut out: Vec<Key> = Vec::new();
     match key.kind() {
@@ -54,7 +51,8 @@ pub(crate) fn referrers(state: &State, key: &Key, limit: usize) -> Vec<Key> {
             let layer = LayerName::from(key.name());
             out.extend(state.in_layer(&layer).take(limit).cloned());
             let services = state.of_kind(Kind::Service, None).filter(|(_, held)| {
-                held.document.spec_member("layers").is_some() && held.document.is_for_layer(layer.as_str())
+                held.document.spec_member("layers").is_some()
+                    && held.document.is_for_layer(layer.as_str())
             });
             out.extend(services.take(limit).map(|(key, _)| key.clone()));
         }

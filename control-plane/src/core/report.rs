@@ -1,4 +1,5 @@
-//! Answers of writes: made from the states before and after, and kept as JSON for requests that come twice.
+//! Answers of writes: made from the states before and after, and kept as JSON for requests that
+//! come twice.
 
 use std::sync::Arc;
 
@@ -17,7 +18,8 @@ use blaze_domain::config::state::State;
 
 /// Places that are named in an answer.
 const MAX_AFFECTED: usize = 1000;
-/// Bytes of an answer that is kept whole. It is written beside the commit, where a store takes no text of any size.
+/// Bytes of an answer that is kept whole. It is written beside the commit, where a store takes no
+/// text of any size.
 const MAX_KEPT_BYTES: usize = 4 * 1024 * 1024;
 
 /// What a request did, and to what.
@@ -58,8 +60,9 @@ impl Done {
     pub(crate) fn report(&self, dry_run: bool) -> ApplyReport {
         let results = self.evaluated.results.iter().map(|(key, action)| {
             let (was, is) = (self.before.get(key), self.after.get(key));
-            let shown =
-                |held: Option<&Arc<blaze_domain::config::state::Held>>| held.map(|held| Arc::clone(&held.shown));
+            let shown = |held: Option<&Arc<blaze_domain::config::state::Held>>| {
+                held.map(|held| Arc::clone(&held.shown))
+            };
             let (was, is) = (shown(was), shown(is));
             let revision = match (action, &is, &was) {
                 (ApplyAction::Unchanged, Some(document), _) => document.revision,
@@ -83,12 +86,8 @@ impl Done {
             }
         });
         let results = results.collect();
-        let keys: Vec<Key> = self
-            .evaluated
-            .changes
-            .iter()
-            .map(|change| change.document.key.clone())
-            .collect();
+        let keys: Vec<Key> =
+            self.evaluated.changes.iter().map(|change| change.document.key.clone()).collect();
         let affected = affected::changed(&self.before, &self.after, &keys, &self.view, self.places);
         ApplyReport {
             dry_run,
@@ -102,7 +101,9 @@ impl Done {
     /// The answer as it is kept for a request that comes again; a large one without what changed.
     pub(crate) fn to_text(&self, kind: AnswerKind) -> String {
         match kind {
-            AnswerKind::Document => self.written().map(|written| written_text(&written)).unwrap_or_default(),
+            AnswerKind::Document => {
+                self.written().map(|written| written_text(&written)).unwrap_or_default()
+            }
             AnswerKind::Report => {
                 let mut report = self.report(false);
                 let text = report_text(&report);
@@ -166,12 +167,7 @@ fn document_from(value: &Value) -> Option<Document> {
     })
 }
 
-type KeptPlace = (
-    Option<ServiceName>,
-    Option<InstanceName>,
-    Option<LayerName>,
-    Option<NodeName>,
-);
+type KeptPlace = (Option<ServiceName>, Option<InstanceName>, Option<LayerName>, Option<NodeName>);
 
 /// An answer of `apply` as it is kept.
 #[derive(Serialize, Deserialize)]
@@ -218,12 +214,7 @@ pub(crate) fn report_from(text: &str) -> Option<ApplyReport> {
             changes: result.changes.iter().map(Delta::from_json).collect::<Option<_>>()?,
         })
     };
-    let place = |(service, instance, layer, node)| Place {
-        service,
-        instance,
-        layer,
-        node,
-    };
+    let place = |(service, instance, layer, node)| Place { service, instance, layer, node };
     Some(ApplyReport {
         dry_run: false,
         revision: kept.revision,

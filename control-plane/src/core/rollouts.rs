@@ -1,4 +1,5 @@
-//! What a roll-out needs to begin: nodes to try its change on, and a change that its target may have.
+//! What a roll-out needs to begin: nodes to try its change on, and a change that its target may
+//! have.
 
 use std::sync::Arc;
 
@@ -21,7 +22,8 @@ pub(super) fn begin(after: &State, rollout: &Document) -> Result<Value, Box<Prob
         return Err(refusal("/spec/canary/node_selector", detail));
     }
     if nodes.len() > MAX_CANARIES {
-        let detail = format!("matches more than {MAX_CANARIES} nodes; choose fewer to try the change on");
+        let detail =
+            format!("matches more than {MAX_CANARIES} nodes; choose fewer to try the change on");
         return Err(refusal("/spec/canary/node_selector", &detail));
     }
     let target = rollout_target(rollout).and_then(|key| after.get(&key));
@@ -68,12 +70,21 @@ fn nodes(after: &State, rollout: &Document) -> Vec<Value> {
         .filter(|(_, held)| selector.matches(&held.document.labels) && counts(&held.document))
         // One more, to tell that they are too many.
         .take(MAX_CANARIES + 1)
-        .map(|(key, _)| json!({ "node": key.name().as_str(), "phase": "pending", "revision": null, "reason": "" }))
+        .map(|(key, _)| {
+            json!({ "node": key.name().as_str(), "phase": "pending", "revision": null,
+            "reason": "" })
+        })
         .collect()
 }
 
 /// Puts into a status how it goes on a canary; a node that became one after the beginning is added.
-pub(super) fn tell_canary(status: &mut Value, node: &str, phase: &str, revision: u64, reason: &str) {
+pub(super) fn tell_canary(
+    status: &mut Value,
+    node: &str,
+    phase: &str,
+    revision: u64,
+    reason: &str,
+) {
     let Some(lines) = status.get_mut("canaries").and_then(Value::as_array_mut) else {
         return;
     };
@@ -93,7 +104,8 @@ pub(super) fn too_large(target: &Document, changed: &Value) -> Result<(), Box<Pr
         return Ok(());
     }
     let detail = format!(
-        "the patch makes of {} a document of {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed",
+        "the patch makes of {} a document of {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are \
+         allowed",
         target.key
     );
     Err(Box::new(Problem::new(Code::PayloadTooLarge, detail)))

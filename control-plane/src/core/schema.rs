@@ -1,4 +1,5 @@
-//! JSON Schemas of services: whether they are sound, and whether effective configurations match them.
+//! JSON Schemas of services: whether they are sound, and whether effective configurations match
+//! them.
 
 use std::collections::{HashMap, HashSet};
 use std::num::NonZeroUsize;
@@ -60,9 +61,7 @@ impl Schemas {
             return Ok(Arc::clone(found));
         }
         if let Some(reference) = foreign_reference(schema) {
-            return Err(format!(
-                "$ref {reference:?} leads out of the schema; only #… is followed"
-            ));
+            return Err(format!("$ref {reference:?} leads out of the schema; only #… is followed"));
         }
         if let Some(dialect) = foreign_dialect(schema) {
             return Err(dialect);
@@ -79,7 +78,8 @@ impl Schemas {
         let compiled = Arc::new(Compiled {
             steps: cost::steps(schema)?,
             full: built(schema)?,
-            // What refers into a keyword that goes leads nowhere: then only the full form can be judged.
+            // What refers into a keyword that goes leads nowhere: then only the full form can be
+            // judged.
             partial: built(&without_required(schema)).or_else(|_| built(&Value::Bool(true)))?,
         });
         self.0.lock().put(id, Arc::clone(&compiled));
@@ -121,8 +121,9 @@ fn patterns(schema: &Value) -> usize {
     }
 }
 
-/// A configuration with a text in place of each secret that says nothing of it, and where they are. Whether a text has a
-/// length or matches a pattern would tell it, one try after the other, to who may not read it.
+/// A configuration with a text in place of each secret that says nothing of it, and where they are.
+/// Whether a text has a length or matches a pattern would tell it, one try after the other, to who
+/// may not read it.
 pub(super) fn with_placeholders(mut config: Value) -> (Value, HashSet<String>) {
     let mut found = HashSet::new();
     if secret::contains(&config) {
@@ -134,16 +135,20 @@ pub(super) fn with_placeholders(mut config: Value) -> (Value, HashSet<String>) {
     (config, found)
 }
 
-/// What is wrong with the dialect that a schema, or a part of it, says it is in: only one is taken. A part in another one
-/// would be read by other rules than those that its cost is told by.
+/// What is wrong with the dialect that a schema, or a part of it, says it is in: only one is taken.
+/// A part in another one would be read by other rules than those that its cost is told by.
 fn foreign_dialect(schema: &Value) -> Option<String> {
     let members = schema.as_object()?;
     let own = own_dialect(members);
     own.or_else(|| {
         members.iter().find_map(|(name, value)| match (name.as_str(), value) {
             (name, value) if ONE.contains(&name) => foreign_dialect(value),
-            (name, Value::Array(list)) if LIST.contains(&name) => list.iter().find_map(foreign_dialect),
-            (name, Value::Object(named)) if NAMED.contains(&name) => named.values().find_map(foreign_dialect),
+            (name, Value::Array(list)) if LIST.contains(&name) => {
+                list.iter().find_map(foreign_dialect)
+            }
+            (name, Value::Object(named)) if NAMED.contains(&name) => {
+                named.values().find_map(foreign_dialect)
+            }
             _ => None,
         })
     })
@@ -153,7 +158,8 @@ fn foreign_dialect(schema: &Value) -> Option<String> {
 pub(super) fn own_dialect(members: &Map<String, Value>) -> Option<String> {
     let dialect = members.get("$schema")?;
     let text = dialect.as_str().map(|text| text.strip_suffix('#').unwrap_or(text));
-    (text != Some(DIALECT)).then(|| format!("$schema {dialect} is another dialect; only {DIALECT} is taken"))
+    (text != Some(DIALECT))
+        .then(|| format!("$schema {dialect} is another dialect; only {DIALECT} is taken"))
 }
 
 /// Keywords whose value is one schema.
@@ -182,8 +188,8 @@ const NAMED: &[&str] = &[
     "properties",
 ];
 
-/// Keywords that can come to hold because something below them fails: with `required` below they cannot be judged without
-/// it, so they go whole. What stands beside them has no meaning then.
+/// Keywords that can come to hold because something below them fails: with `required` below they
+/// cannot be judged without it, so they go whole. What stands beside them has no meaning then.
 const TURNING: &[(&str, &[&str])] = &[
     ("contains", &["contains", "minContains", "maxContains"]),
     ("if", &["if", "then", "else"]),
@@ -191,8 +197,8 @@ const TURNING: &[(&str, &[&str])] = &[
     ("oneOf", &["oneOf"]),
 ];
 
-/// The same schema with the keyword `required` taken out wherever it is a keyword (a property may be called so), and with
-/// it what cannot be judged without it.
+/// The same schema with the keyword `required` taken out wherever it is a keyword (a property may
+/// be called so), and with it what cannot be judged without it.
 pub(crate) fn without_required(schema: &Value) -> Value {
     let mut anchors = HashMap::new();
     // What has faults is refused elsewhere.
@@ -206,11 +212,7 @@ pub(crate) fn without_required(schema: &Value) -> Value {
     };
     let out = strip.stripped(schema);
     // What is left over depends on what was looked at, which is less now.
-    if strip.is_any_dropped {
-        without_unevaluated(&out)
-    } else {
-        out
-    }
+    if strip.is_any_dropped { without_unevaluated(&out) } else { out }
 }
 
 struct Strip<'s> {
@@ -236,7 +238,9 @@ impl<'s> Strip<'s> {
             }
         }
         let kept = members.iter().filter(|(name, _)| !dropped.contains(&name.as_str()));
-        let kept = kept.map(|(name, value)| (name.clone(), subschemas(name, value, &mut |one| self.stripped(one))));
+        let kept = kept.map(|(name, value)| {
+            (name.clone(), subschemas(name, value, &mut |one| self.stripped(one)))
+        });
         Value::Object(kept.collect())
     }
 
@@ -273,7 +277,9 @@ impl<'s> Strip<'s> {
                 target.is_some_and(|target| self.finds(target, seen))
             }
             (name, value) if ONE.contains(&name) || LIST.contains(&name) => self.finds(value, seen),
-            (name, Value::Object(named)) if NAMED.contains(&name) && !matches!(name, "$defs" | "definitions") => {
+            (name, Value::Object(named))
+                if NAMED.contains(&name) && !matches!(name, "$defs" | "definitions") =>
+            {
                 named.values().any(|one| self.finds(one, seen))
             }
             _ => false,
@@ -282,7 +288,11 @@ impl<'s> Strip<'s> {
 }
 
 /// The value of a keyword with each subschema in it changed.
-fn subschemas<'s>(name: &str, value: &'s Value, change: &mut dyn FnMut(&'s Value) -> Value) -> Value {
+fn subschemas<'s>(
+    name: &str,
+    value: &'s Value,
+    change: &mut dyn FnMut(&'s Value) -> Value,
+) -> Value {
     match value {
         value if ONE.contains(&name) => change(value),
         Value::Array(list) if LIST.contains(&name) => list.iter().map(change).collect(),
@@ -302,12 +312,18 @@ fn without_unevaluated(schema: &Value) -> Value {
     let kept = members
         .iter()
         .filter(|(name, _)| !matches!(name.as_str(), "unevaluatedItems" | "unevaluatedProperties"));
-    let kept = kept.map(|(name, value)| (name.clone(), subschemas(name, value, &mut without_unevaluated)));
+    let kept =
+        kept.map(|(name, value)| (name.clone(), subschemas(name, value, &mut without_unevaluated)));
     Value::Object(kept.collect())
 }
 
-/// What a reference within a schema leads to. Percent-encoding leads nowhere: decoded it could be another place.
-pub(super) fn resolve<'s>(root: &'s Value, anchors: &HashMap<&str, &'s Value>, reference: &str) -> Option<&'s Value> {
+/// What a reference within a schema leads to. Percent-encoding leads nowhere: decoded it could be
+/// another place.
+pub(super) fn resolve<'s>(
+    root: &'s Value,
+    anchors: &HashMap<&str, &'s Value>,
+    reference: &str,
+) -> Option<&'s Value> {
     let fragment = reference.strip_prefix('#').unwrap_or(reference);
     if fragment.contains('%') {
         return None;
@@ -321,10 +337,14 @@ pub(super) fn resolve<'s>(root: &'s Value, anchors: &HashMap<&str, &'s Value>, r
 /// A `$ref` that is not within the document.
 fn foreign_reference(value: &Value) -> Option<String> {
     match value {
-        Value::Object(members) => members.iter().find_map(|(name, value)| match (name.as_str(), value) {
-            ("$ref" | "$dynamicRef", Value::String(target)) if !target.starts_with('#') => Some(target.clone()),
-            (_, value) => foreign_reference(value),
-        }),
+        Value::Object(members) => {
+            members.iter().find_map(|(name, value)| match (name.as_str(), value) {
+                ("$ref" | "$dynamicRef", Value::String(target)) if !target.starts_with('#') => {
+                    Some(target.clone())
+                }
+                (_, value) => foreign_reference(value),
+            })
+        }
         Value::Array(list) => list.iter().find_map(foreign_reference),
         Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => None,
     }
@@ -366,7 +386,10 @@ mod tests {
     fn required_goes_as_a_keyword_and_stays_as_a_property() {
         let schema = json!({
             "type": "object", "required": ["a"],
-            "properties": { "required": { "type": "array" }, "a": { "required": ["b"], "type": "object" } },
+            "properties": {
+                "required": { "type": "array" },
+                "a": { "required": ["b"], "type": "object" },
+            },
             "allOf": [{ "required": ["c"] }], "enum": [{ "required": 1 }],
             "dependencies": { "a": { "required": ["b"] }, "b": ["a"] },
         });
@@ -384,10 +407,7 @@ mod tests {
         assert!(schemas.check(&json!({ "type": "object" })).is_ok());
         assert!(schemas.check(&json!(true)).is_ok());
         for (bad, why) in [
-            (
-                json!({ "properties": { "a": { "type": "objekt" } } }),
-                "/properties/a/type",
-            ),
+            (json!({ "properties": { "a": { "type": "objekt" } } }), "/properties/a/type"),
             (json!({ "properties": { "a": { "pattern": "(" } } }), "/properties/a"),
             (json!({ "pattern": "(a)\\1" }), "back-references"),
             (json!({ "pattern": "a(?=b)" }), "look-around"),
@@ -412,9 +432,8 @@ mod tests {
         };
         let twice = |target: String| json!({ "allOf": [{ "$ref": target }, { "$ref": target }] });
         // Each definition leads twice to the next one.
-        let mut defs: Map<String, Value> = (0..30)
-            .map(|n| (format!("d{n}"), twice(format!("#/$defs/d{}", n + 1))))
-            .collect();
+        let mut defs: Map<String, Value> =
+            (0..30).map(|n| (format!("d{n}"), twice(format!("#/$defs/d{}", n + 1)))).collect();
         defs.insert("d30".to_owned(), json!(true));
         refused(&json!({ "$ref": "#/$defs/d0", "$defs": defs }));
         // Each level of the configuration is checked twice as often as the one above it.
@@ -432,11 +451,13 @@ mod tests {
     fn a_schema_may_lead_back_to_itself() {
         let schemas = Schemas::default();
         for schema in [
-            json!({ "properties": { "left": { "$ref": "#" }, "right": { "$ref": "#" }, "value": true } }),
+            json!({ "properties": { "left": { "$ref": "#" }, "right": { "$ref": "#" },
+                "value": true } }),
             json!({ "type": ["object", "string"], "additionalProperties": { "$ref": "#" } }),
             json!({
                 "properties": { "shape": { "$ref": "#shape" } },
-                "$defs": { "shape": { "$anchor": "shape", "anyOf": [true, { "items": { "$ref": "#shape" } }] } },
+                "$defs": { "shape": { "$anchor": "shape",
+                    "anyOf": [true, { "items": { "$ref": "#shape" } }] } },
             }),
         ] {
             assert!(schemas.check(&schema).is_ok(), "{schema}");
@@ -447,13 +468,18 @@ mod tests {
     fn what_turns_on_required_goes_with_it() {
         let required = || json!({ "required": ["a"], "type": "object" });
         let schema = json!({
-            "not": required(), "if": { "properties": { "x": required() } }, "then": { "type": "object" }, "else": false,
+            "not": required(), "if": { "properties": { "x": required() } },
+            "then": { "type": "object" }, "else": false,
             "oneOf": [true, { "$ref": "#/$defs/d" }], "contains": required(), "maxContains": 1,
             "properties": { "y": { "not": { "type": "null" }, "if": true, "then": required() } },
-            "unevaluatedProperties": false, "$defs": { "d": { "allOf": [{ "$ref": "#e" }] }, "e": { "$anchor": "e", "required": [] } },
+            "unevaluatedProperties": false, "$defs": {
+                "d": { "allOf": [{ "$ref": "#e" }] },
+                "e": { "$anchor": "e", "required": [] },
+            },
         });
         let expected = json!({
-            "properties": { "y": { "not": { "type": "null" }, "if": true, "then": { "type": "object" } } },
+            "properties": { "y": { "not": { "type": "null" }, "if": true,
+                "then": { "type": "object" } } },
             "$defs": { "d": { "allOf": [{ "$ref": "#e" }] }, "e": { "$anchor": "e" } },
         });
         assert_eq!(without_required(&schema), expected);
@@ -461,7 +487,10 @@ mod tests {
         let schemas = Schemas::default();
         let into = json!({ "not": required(), "properties": { "x": { "$ref": "#/not" } } });
         let compiled = schemas.compiled(&into).unwrap();
-        assert!(compiled.partial.is_valid(&json!({ "x": 1 })) && !compiled.full.is_valid(&json!({ "x": 1 })));
+        assert!(
+            compiled.partial.is_valid(&json!({ "x": 1 }))
+                && !compiled.full.is_valid(&json!({ "x": 1 }))
+        );
     }
 
     #[test]
@@ -486,7 +515,8 @@ mod tests {
                 assert!(error.contains("another dialect"), "{schema}: {error}");
             }
         }
-        let own = json!({ "properties": { "a": { "$schema": DIALECT } }, "enum": [{ "$schema": "x" }] });
+        let own =
+            json!({ "properties": { "a": { "$schema": DIALECT } }, "enum": [{ "$schema": "x" }] });
         assert!(schemas.check(&own).is_ok());
         let named = json!({ "properties": { "$schema": { "type": "string" } } });
         assert!(schemas.check(&named).is_ok());
@@ -495,10 +525,12 @@ mod tests {
     #[test]
     fn a_schema_has_so_many_patterns() {
         let of = |count: usize| {
-            let list: Vec<Value> = (0..count)
-                .map(|number| json!({ "pattern": format!("^{number}$") }))
-                .collect();
-            json!({ "properties": { "pattern": { "prefixItems": list } }, "patternProperties": { "^a": true } })
+            let list: Vec<Value> =
+                (0..count).map(|number| json!({ "pattern": format!("^{number}$") })).collect();
+            json!({
+                "properties": { "pattern": { "prefixItems": list } },
+                "patternProperties": { "^a": true },
+            })
         };
         let schemas = Schemas::default();
         assert_eq!(schemas.check(&of(199)), Ok(()));

@@ -19,7 +19,8 @@ pub(crate) struct Vault<'a> {
     pub(crate) uid: &'a str,
     /// The document as it is now.
     pub(crate) current: Option<&'a Document>,
-    /// Uid under which encrypted secrets in what is written were encrypted: of a version that is brought back.
+    /// Uid under which encrypted secrets in what is written were encrypted: of a version that is
+    /// brought back.
     pub(crate) from_uid: &'a str,
     /// Revision of the change.
     pub(crate) revision: u64,
@@ -52,15 +53,21 @@ impl Vault<'_> {
             return Ok(());
         }
         let mut faults = Vec::new();
-        let now = self
-            .current
-            .map_or(Counterpart::Nothing, |document| Counterpart::Is(&document.spec));
+        let now =
+            self.current.map_or(Counterpart::Nothing, |document| Counterpart::Is(&document.spec));
         self.fill("", spec, now, &mut faults);
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
 
-    /// Walks what is written along with what is there now: members by name, items as [`counterparts`] says.
-    fn fill(&self, pointer: &str, value: &mut Value, now: Counterpart<'_>, faults: &mut Vec<FieldFault>) {
+    /// Walks what is written along with what is there now: members by name, items as
+    /// [`counterparts`] says.
+    fn fill(
+        &self,
+        pointer: &str,
+        value: &mut Value,
+        now: Counterpart<'_>,
+        faults: &mut Vec<FieldFault>,
+    ) {
         if secret::is_secret(value) {
             match self.one(value, now) {
                 Ok(Some(stored)) => *value = stored,
@@ -79,7 +86,9 @@ impl Vault<'_> {
             Value::Array(items) => {
                 let found = match now {
                     Counterpart::Is(Value::Array(current)) => self.counterparts(items, current),
-                    Counterpart::Is(_) | Counterpart::Nothing => vec![Counterpart::Nothing; items.len()],
+                    Counterpart::Is(_) | Counterpart::Nothing => {
+                        vec![Counterpart::Nothing; items.len()]
+                    }
                     Counterpart::Unclear => vec![Counterpart::Unclear; items.len()],
                 };
                 for (index, (item, now)) in items.iter_mut().zip(found).enumerate() {
@@ -98,8 +107,9 @@ impl Vault<'_> {
         }
     }
 
-    /// Which item of a list as it is now each item of the list as it is written stands for. An item has no name, so it is
-    /// known by what it holds: a secret must not go to another item because the items before it went away.
+    /// Which item of a list as it is now each item of the list as it is written stands for. An item
+    /// has no name, so it is known by what it holds: a secret must not go to another item because
+    /// the items before it went away.
     ///
     /// ```text
     /// equal to one item as it is shown      that one
@@ -126,13 +136,14 @@ impl Vault<'_> {
                 .iter()
                 .enumerate()
                 .all(|(index, text)| places.get(text).is_none_or(|found| is_at(found, index)));
-        // An item that is written as often as it was there is itself; in place, so is each that is still there.
+        // An item that is written as often as it was there is itself; in place, so is each that is
+        // still there.
         let left: HashSet<usize> = match is_in_place {
-            true => (0..items.len())
-                .filter(|index| !places.contains_key(&texts[*index]))
-                .collect(),
+            true => (0..items.len()).filter(|index| !places.contains_key(&texts[*index])).collect(),
             false => {
-                let is_left = |text: &str, found: usize| written.get(text).copied().unwrap_or_default() < found;
+                let is_left = |text: &str, found: usize| {
+                    written.get(text).copied().unwrap_or_default() < found
+                };
                 let left = places.iter().filter(|(text, found)| is_left(text, found.len()));
                 left.flat_map(|(_, found)| found.iter().copied()).collect()
             }
@@ -161,7 +172,11 @@ impl Vault<'_> {
             out.push(match equal {
                 [] => edited.place_of(item, index).map_or(Counterpart::Unclear, at),
                 [only] => at(*only),
-                [first, ..] if *same.entry(text).or_insert_with(|| self.same_texts(equal, current)) => at(*first),
+                [first, ..]
+                    if *same.entry(text).or_insert_with(|| self.same_texts(equal, current)) =>
+                {
+                    at(*first)
+                }
                 [_, ..] if written.get(text.as_str()) == Some(&equal.len()) => at(equal[nth]),
                 _ if is_in_place => at(index),
                 _ => Counterpart::Unclear,
@@ -188,10 +203,7 @@ impl Vault<'_> {
         let Some(first) = indices.first().and_then(|index| texts(*index)) else {
             return false;
         };
-        indices
-            .iter()
-            .skip(1)
-            .all(|index| texts(*index).as_ref() == Some(&first))
+        indices.iter().skip(1).all(|index| texts(*index).as_ref() == Some(&first))
     }
 
     /// The text of a stored secret of the document.
@@ -206,13 +218,15 @@ impl Vault<'_> {
             Counterpart::Is(now) => Some(now),
             Counterpart::Nothing | Counterpart::Unclear => None,
         };
-        let stored_now = stored_now.filter(|value| matches!(Secret::of(value), Some(Ok(Secret::Stored { .. }))));
+        let stored_now =
+            stored_now.filter(|value| matches!(Secret::of(value), Some(Ok(Secret::Stored { .. }))));
         let text = match Secret::of(value) {
             Some(Ok(Secret::Redacted { .. })) => {
                 let kept = stored_now.ok_or_else(|| {
                     let detail = match now {
                         Counterpart::Unclear => {
-                            "it is not clear whose stored secret this item of a list keeps, for items were changed and moved \
+                            "it is not clear whose stored secret this item of a list keeps, for \
+                             items were changed and moved \
                              at once; write its text, or change the list in two steps"
                         }
                         Counterpart::Is(_) | Counterpart::Nothing => {
@@ -223,13 +237,14 @@ impl Vault<'_> {
                 })?;
                 return self.keep(kept).map(Some);
             }
-            Some(Ok(Secret::Text(text) | Secret::Revealed { text, .. })) => Zeroizing::new(text.to_owned()),
-            Some(Ok(Secret::Stored { .. })) => self.open(self.from_uid, value).map_err(|error| {
-                (
-                    Code::SecretUnknown,
-                    format!("the stored secret cannot be read: {error}"),
-                )
-            })?,
+            Some(Ok(Secret::Text(text) | Secret::Revealed { text, .. })) => {
+                Zeroizing::new(text.to_owned())
+            }
+            Some(Ok(Secret::Stored { .. })) => {
+                self.open(self.from_uid, value).map_err(|error| {
+                    (Code::SecretUnknown, format!("the stored secret cannot be read: {error}"))
+                })?
+            }
             Some(Err(reason)) => return Err((Code::ValidationFailed, reason)),
             None => return Ok(None),
         };
@@ -240,9 +255,7 @@ impl Vault<'_> {
             return self.keep(stored).map(Some);
         }
         let sealed = self.keyring.seal(self.key, self.uid, &text, self.revision);
-        sealed
-            .map(Some)
-            .map_err(|error| (Code::ValidationFailed, error.to_string()))
+        sealed.map(Some).map_err(|error| (Code::ValidationFailed, error.to_string()))
     }
 
     /// A secret that is there already, under the uid that the document has from now on.
@@ -252,9 +265,7 @@ impl Vault<'_> {
             return Ok(stored.clone());
         }
         let unreadable = |error: String| (Code::SecretUnknown, error);
-        let text = self
-            .open(current, stored)
-            .map_err(|error| unreadable(error.to_string()))?;
+        let text = self.open(current, stored).map_err(|error| unreadable(error.to_string()))?;
         let sealed = self.keyring.seal(self.key, self.uid, &text, self.revision);
         sealed.map_err(|error| unreadable(error.to_string()))
     }
@@ -271,8 +282,8 @@ pub(crate) fn unreadable(keyring: &Keyring, document: &Document) -> Option<OpenE
     found
 }
 
-/// A value with its secrets as `{"$secret":{"text","version"}}`. What cannot be decrypted stays redacted: an empty
-/// text, written back, would take the place of the secret.
+/// A value with its secrets as `{"$secret":{"text","version"}}`. What cannot be decrypted stays
+/// redacted: an empty text, written back, would take the place of the secret.
 pub(crate) fn revealed(keyring: &Keyring, document: &Document, value: &Value) -> Value {
     replaced(keyring, document, value, |text, version| match text {
         Some(text) => Secret::Revealed { text, version }.to_json(),
@@ -280,7 +291,12 @@ pub(crate) fn revealed(keyring: &Keyring, document: &Document, value: &Value) ->
     })
 }
 
-fn replaced(keyring: &Keyring, document: &Document, value: &Value, form: impl Fn(Option<&str>, u64) -> Value) -> Value {
+fn replaced(
+    keyring: &Keyring,
+    document: &Document,
+    value: &Value,
+    form: impl Fn(Option<&str>, u64) -> Value,
+) -> Value {
     let mut out = value.clone();
     secret::map(&mut out, &mut |_, found| {
         let version = match Secret::of(found) {
@@ -307,17 +323,14 @@ mod tests {
         pub(super) static OPENED: Cell<usize> = const { Cell::new(0) };
     }
 
-    fn stored(keyring: &Keyring, current: Option<&Document>, spec: &Value) -> Result<Value, Vec<FieldFault>> {
+    fn stored(
+        keyring: &Keyring,
+        current: Option<&Document>,
+        spec: &Value,
+    ) -> Result<Value, Vec<FieldFault>> {
         let mut spec = spec.clone();
         let key: Key = "Service/s".parse().unwrap();
-        let vault = Vault {
-            keyring,
-            key: &key,
-            uid: "u",
-            current,
-            from_uid: "u",
-            revision: 1,
-        };
+        let vault = Vault { keyring, key: &key, uid: "u", current, from_uid: "u", revision: 1 };
         vault.store(&mut spec).map(|()| spec)
     }
 
@@ -326,10 +339,7 @@ mod tests {
         let keyring = Keyring::with_keys(&[("e1", [7; 32])]).unwrap();
         let twins: Vec<Value> = (0..3000).map(|_| json!({ "pw": { "$secret": "A" } })).collect();
         let mut spec = stored(&keyring, None, &json!({ "config": { "list": twins } })).unwrap();
-        let current = Document {
-            uid: "u".to_owned(),
-            ..document("Service/s", spec.clone())
-        };
+        let current = Document { uid: "u".to_owned(), ..document("Service/s", spec.clone()) };
         spec = secret::redact(&spec).into_owned();
         spec["config"]["list"].as_array_mut().unwrap().pop();
         OPENED.with(|opened| opened.set(0));

@@ -114,7 +114,8 @@ impl ConfigService {
         let snapshot = options.store.load().await?;
         let state = State::new(snapshot.revision, snapshot.documents);
         tracing::info!(
-            store_id = %snapshot.store_id, revision = snapshot.revision, documents = state.len(), floor = snapshot.floor,
+            store_id = %snapshot.store_id, revision = snapshot.revision, documents = state.len(),
+            floor = snapshot.floor,
             "the configuration is loaded"
         );
         tell_unreadable(&options.keyring, &state);
@@ -177,14 +178,20 @@ impl ConfigService {
         Ok(service)
     }
 
-    /// Who a token belongs to. Without `bearer` it is an administrator in development, and nobody otherwise.
+    /// Who a token belongs to. Without `bearer` it is an administrator in development, and nobody
+    /// otherwise.
     ///
     /// # Errors
     /// [`Code::Unauthenticated`], the same for all causes; the cause is in `internal`.
-    pub fn authenticate(&self, bearer: Option<&str>, address: IpAddr) -> Result<Arc<Claims>, Problem> {
+    pub fn authenticate(
+        &self,
+        bearer: Option<&str>,
+        address: IpAddr,
+    ) -> Result<Arc<Claims>, Problem> {
         let refuse = |reason: &str| {
             let detail = "a valid token is needed: Authorization: Bearer <token>";
-            Err(Problem::new(Code::Unauthenticated, detail).because(format!("{reason} (from {address})")))
+            Err(Problem::new(Code::Unauthenticated, detail)
+                .because(format!("{reason} (from {address})")))
         };
         let (authenticator, bearer) = match (&self.inner.authenticator, bearer, &self.inner.dev) {
             (None, _, Some(dev)) | (Some(_), None, Some(dev)) => return Ok(Arc::clone(dev)),
@@ -244,22 +251,26 @@ impl ConfigService {
     }
 }
 
-/// Secrets that do not open stay redacted even where they are to be revealed, and services do not get them: say so.
+/// Secrets that do not open stay redacted even where they are to be revealed, and services do not
+/// get them: say so.
 fn tell_unreadable(keyring: &Keyring, state: &State) {
-    let mut unreadable = state
-        .all()
-        .filter_map(|(key, held)| secrets::unreadable(keyring, &held.document).map(|error| (key, error)));
+    let mut unreadable = state.all().filter_map(|(key, held)| {
+        secrets::unreadable(keyring, &held.document).map(|error| (key, error))
+    });
     if let Some((first, error)) = unreadable.next() {
         tracing::error!(
             documents = unreadable.count() + 1, %first, %error,
-            "there are secrets that cannot be read: put their key back among control_plane.encryption.keys, or write them anew"
+            "there are secrets that cannot be read: put their key back among \
+             control_plane.encryption.keys, or write them anew"
         );
     }
 }
 
 /// A label selector as it was given.
 pub(crate) fn selector(text: &str) -> Result<LabelSelector, Problem> {
-    let refuse = |error: String| Problem::new(Code::InvalidLabelSelector, format!("label_selector {text:?}: {error}"));
+    let refuse = |error: String| {
+        Problem::new(Code::InvalidLabelSelector, format!("label_selector {text:?}: {error}"))
+    };
     text.parse::<LabelSelector>().map_err(|error| refuse(error.to_string()))
 }
 

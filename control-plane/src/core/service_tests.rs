@@ -33,11 +33,7 @@ struct World {
 async fn world() -> World {
     let supervisor = Supervisor::new("test");
     let service = testing::service(&supervisor).await.unwrap();
-    World {
-        admin: caller(&["admin"], None),
-        service,
-        _supervisor: supervisor,
-    }
+    World { admin: caller(&["admin"], None), service, _supervisor: supervisor }
 }
 
 fn caller(roles: &[&str], layer: Option<&str>) -> Caller {
@@ -59,12 +55,7 @@ fn key(text: &str) -> Key {
 }
 
 fn input(name: &str, spec: Value) -> DocumentInput {
-    DocumentInput {
-        key: key(name),
-        labels: Labels::new(),
-        annotations: Labels::new(),
-        spec,
-    }
+    DocumentInput { key: key(name), labels: Labels::new(), annotations: Labels::new(), spec }
 }
 
 impl World {
@@ -72,17 +63,19 @@ impl World {
         self.try_put(name, spec, Precondition::Any).await.unwrap().document
     }
 
-    async fn try_put(&self, name: &str, spec: Value, precondition: Precondition) -> Result<Written, Problem> {
+    async fn try_put(
+        &self,
+        name: &str,
+        spec: Value,
+        precondition: Precondition,
+    ) -> Result<Written, Problem> {
         let exists = self.get(name).await.is_ok();
         let precondition = if exists || precondition != Precondition::Any {
             precondition
         } else {
             Precondition::None
         };
-        let answer = self
-            .service
-            .replace(&self.admin, input(name, spec), precondition)
-            .await?;
+        let answer = self.service.replace(&self.admin, input(name, spec), precondition).await?;
         Ok(answer.value)
     }
 
@@ -92,10 +85,7 @@ impl World {
     }
 
     async fn patch(&self, name: &str, patch: Value) -> Result<Arc<Document>, Problem> {
-        let answer = self
-            .service
-            .patch(&self.admin, &key(name), patch, Precondition::Any)
-            .await?;
+        let answer = self.service.patch(&self.admin, &key(name), patch, Precondition::Any).await?;
         Ok(answer.value.document)
     }
 
@@ -106,10 +96,7 @@ impl World {
 
     /// A document with its secrets as text.
     async fn revealed(&self, name: &str) -> Arc<Document> {
-        let reveal = ReadOptions {
-            reveal: true,
-            ..ReadOptions::default()
-        };
+        let reveal = ReadOptions { reveal: true, ..ReadOptions::default() };
         self.service.get(&self.admin, &key(name), &reveal).await.unwrap().value
     }
 
@@ -119,20 +106,13 @@ impl World {
             revision: None,
             delete: false,
         });
-        let request = ApplyRequest {
-            items: items.collect(),
-            ..ApplyRequest::default()
-        };
+        let request = ApplyRequest { items: items.collect(), ..ApplyRequest::default() };
         Ok(self.service.apply(&self.admin, request, None).await?.value)
     }
 
     async fn effective(&self, place: Place) -> Effective {
         let read = ReadOptions::default();
-        self.service
-            .effective(&self.admin, &place, true, &read)
-            .await
-            .unwrap()
-            .value
+        self.service.effective(&self.admin, &place, true, &read).await.unwrap().value
     }
 
     /// A robot in an edge layer with a service that has one instance.
@@ -141,13 +121,14 @@ impl World {
             .apply(vec![
                 (
                     "Layer/edge",
-                    json!({ "kind": "edge", "config": { "a": 1, "b": 1 }, "overrides": { "slam": { "c": 3 } } }),
+                    json!({
+                        "kind": "edge",
+                        "config": { "a": 1, "b": 1 },
+                        "overrides": { "slam": { "c": 3 } },
+                    }),
                 ),
                 ("Node/robot-1", json!({ "layer": "edge", "config": { "b": 2 } })),
-                (
-                    "Service/slam",
-                    json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } }),
-                ),
+                ("Service/slam", json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } })),
                 (
                     "Instance/slam/0",
                     json!({ "node": "robot-1", "config": { "camera": { "rate_hz": 10 } } }),
@@ -180,10 +161,7 @@ async fn a_document_is_made_read_changed_and_deleted() {
     // The same again changes nothing, also where `{}` is written out.
     let same = w.put("Layer/edge", json!({ "kind": "edge", "config": {} })).await;
     assert_eq!(same.revision, 1);
-    let patched = w
-        .patch("Layer/edge", json!({ "labels": { "site": "lab" } }))
-        .await
-        .unwrap();
+    let patched = w.patch("Layer/edge", json!({ "labels": { "site": "lab" } })).await.unwrap();
     assert_eq!((patched.revision, patched.uid == made.uid), (2, true));
     assert_eq!(w.service.revision(), 2);
     w.delete("Layer/edge", false).await.unwrap();
@@ -202,11 +180,7 @@ async fn preconditions_are_insisted_on() {
         Code::PreconditionFailed
     );
     assert_eq!(
-        code(
-            w.service
-                .patch(&w.admin, &key("Layer/edge"), json!({}), Precondition::None)
-                .await
-        ),
+        code(w.service.patch(&w.admin, &key("Layer/edge"), json!({}), Precondition::None).await),
         Code::NotFound
     );
     w.put("Layer/edge", spec()).await;
@@ -218,19 +192,15 @@ async fn preconditions_are_insisted_on() {
         code(w.try_put("Layer/edge", other(), Precondition::Absent).await),
         Code::PreconditionFailed
     );
-    let stale = w
-        .try_put("Layer/edge", other(), Precondition::Revisions(vec![7]))
-        .await
-        .unwrap_err();
+    let stale =
+        w.try_put("Layer/edge", other(), Precondition::Revisions(vec![7])).await.unwrap_err();
     assert_eq!((stale.code, stale.revision), (Code::PreconditionFailed, Some(1)));
     assert_eq!(
         code(w.service.create(&w.admin, input("Layer/edge", spec()), None).await),
         Code::AlreadyExists
     );
-    let written = w
-        .try_put("Layer/edge", other(), Precondition::Revisions(vec![7, 1]))
-        .await
-        .unwrap();
+    let written =
+        w.try_put("Layer/edge", other(), Precondition::Revisions(vec![7, 1])).await.unwrap();
     assert_eq!((written.created, written.document.revision), (false, 2));
 }
 
@@ -239,25 +209,16 @@ async fn the_effective_configuration_is_merged_in_order_and_explained() {
     let w = world().await;
     w.robot().await;
     let effective = w.effective(slam()).await;
-    assert_eq!(
-        effective.config,
-        json!({ "a": 1, "b": 2, "c": 3, "camera": { "rate_hz": 10 } })
-    );
-    assert_eq!(
-        effective.place.node.as_ref().map(ToString::to_string).as_deref(),
-        Some("robot-1")
-    );
+    assert_eq!(effective.config, json!({ "a": 1, "b": 2, "c": 3, "camera": { "rate_hz": 10 } }));
+    assert_eq!(effective.place.node.as_ref().map(ToString::to_string).as_deref(), Some("robot-1"));
     let explain = effective.explain.unwrap();
     assert_eq!(explain["/camera/rate_hz"]["kind"], "Instance");
     assert_eq!(explain["/camera/rate_hz"]["overridden"][0]["value"], 30);
     assert_eq!(explain["/c"]["override"], true);
     let mut unknown = slam();
     unknown.service = Some("slamm".parse().unwrap());
-    let refused = w
-        .service
-        .effective(&w.admin, &unknown, false, &ReadOptions::default())
-        .await
-        .unwrap_err();
+    let refused =
+        w.service.effective(&w.admin, &unknown, false, &ReadOptions::default()).await.unwrap_err();
     assert_eq!(refused.code, Code::NotFound);
     assert!(refused.detail.contains("did you mean slam?"), "{refused}");
 }
@@ -288,28 +249,18 @@ async fn a_schema_guards_every_write_that_could_break_it() {
     w.robot().await;
     let schema = json!({
         "type": "object", "required": ["camera"],
-        "properties": { "camera": { "type": "object", "properties": { "rate_hz": { "type": "integer", "maximum": 30 } } } },
+        "properties": { "camera": { "type": "object",
+            "properties": { "rate_hz": { "type": "integer", "maximum": 30 } } } },
     });
-    w.patch("Service/slam", json!({ "spec": { "schema": schema } }))
-        .await
-        .unwrap();
+    w.patch("Service/slam", json!({ "spec": { "schema": schema } })).await.unwrap();
     for (name, patch) in [
-        (
-            "Instance/slam/0",
-            json!({ "spec": { "config": { "camera": { "rate_hz": 31 } } } }),
-        ),
+        ("Instance/slam/0", json!({ "spec": { "config": { "camera": { "rate_hz": 31 } } } })),
         (
             "Node/robot-1",
             json!({ "spec": { "overrides": { "slam": { "camera": { "rate_hz": "fast" } } } } }),
         ),
-        (
-            "Layer/edge",
-            json!({ "spec": { "overrides": { "slam": { "camera": 5 } } } }),
-        ),
-        (
-            "Service/slam",
-            json!({ "spec": { "config": { "camera": { "rate_hz": 99 } } } }),
-        ),
+        ("Layer/edge", json!({ "spec": { "overrides": { "slam": { "camera": 5 } } } })),
+        ("Service/slam", json!({ "spec": { "config": { "camera": { "rate_hz": 99 } } } })),
     ] {
         let refused = w.patch(name, patch).await.unwrap_err();
         assert_eq!(refused.code, Code::SchemaMismatch, "{name}");
@@ -336,27 +287,18 @@ async fn apply_is_all_or_nothing() {
         ])
         .await
         .unwrap_err();
-    assert_eq!(
-        (refused.code, refused.errors[0].document),
-        (Code::ReferenceNotFound, Some(1))
-    );
+    assert_eq!((refused.code, refused.errors[0].document), (Code::ReferenceNotFound, Some(1)));
     assert!(refused.detail.contains("did you mean Layer/fog?"), "{refused}");
     assert_eq!(code(w.get("Layer/fog").await), Code::NotFound);
     let twice = w
-        .apply(vec![
-            ("Layer/x", json!({ "kind": "fog" })),
-            ("Layer/x", json!({ "kind": "fog" })),
-        ])
+        .apply(vec![("Layer/x", json!({ "kind": "fog" })), ("Layer/x", json!({ "kind": "fog" }))])
         .await;
     assert_eq!(code(twice), Code::ValidationFailed);
     let report = w
         .apply(vec![
             ("Node/robot-1", json!({ "layer": "edge", "config": { "b": 5 } })),
             ("Layer/fog", json!({ "kind": "fog" })),
-            (
-                "Service/slam",
-                json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } }),
-            ),
+            ("Service/slam", json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } })),
         ])
         .await
         .unwrap();
@@ -364,10 +306,7 @@ async fn apply_is_all_or_nothing() {
     assert_eq!(actions, ["updated", "created", "unchanged"]);
     assert_eq!(report.results[0].changes[0].path, "/spec/config/b");
     assert!(
-        report
-            .affected
-            .iter()
-            .any(|place| place.instance.is_some() && place.node.is_some()),
+        report.affected.iter().any(|place| place.instance.is_some() && place.node.is_some()),
         "{report:?}"
     );
     assert_eq!(report.revision, 2);
@@ -411,19 +350,13 @@ async fn what_is_written_leaves_an_old_key_behind_and_what_has_no_key_is_not_sho
     let (old, new) = (("e1", [7; 32]), ("e2", [8; 32]));
     let w = world_on(&store, &[old]).await;
     for name in ["Service/a", "Service/b"] {
-        w.put(name, json!({ "config": { "password": { "$secret": "canary" } } }))
-            .await;
+        w.put(name, json!({ "config": { "password": { "$secret": "canary" } } })).await;
     }
     let w = world_on(&store, &[new, old]).await;
-    let again = json!({ "config": { "password": { "$secret": { "redacted": true, "version": 1 } } } });
-    assert_eq!(
-        w.put("Service/a", again).await.revision,
-        1,
-        "a new key alone is no change"
-    );
-    w.patch("Service/a", json!({ "spec": { "description": "x" } }))
-        .await
-        .unwrap();
+    let again =
+        json!({ "config": { "password": { "$secret": { "redacted": true, "version": 1 } } } });
+    assert_eq!(w.put("Service/a", again).await.revision, 1, "a new key alone is no change");
+    w.patch("Service/a", json!({ "spec": { "description": "x" } })).await.unwrap();
 
     let w = world_on(&store, &[new]).await;
     let password = async |name: &str| {
@@ -452,15 +385,9 @@ async fn secrets_are_kept_encrypted_and_shown_redacted() {
     // What was read may be written back: the text stays.
     let same = w.put("Service/slam", spec(redacted.clone())).await;
     assert_eq!(same.revision, 1);
-    let changed = w
-        .patch("Service/slam", json!({ "spec": { "description": "x" } }))
-        .await
-        .unwrap();
+    let changed = w.patch("Service/slam", json!({ "spec": { "description": "x" } })).await.unwrap();
     assert_eq!(changed.spec.pointer("/config/db/password"), Some(&redacted));
-    let reveal = ReadOptions {
-        reveal: true,
-        ..ReadOptions::default()
-    };
+    let reveal = ReadOptions { reveal: true, ..ReadOptions::default() };
     let clear = w.revealed("Service/slam").await;
     let shown = json!({ "$secret": { "text": canary, "version": 1 } });
     assert_eq!(clear.spec.pointer("/config/db/password"), Some(&shown));
@@ -473,19 +400,10 @@ async fn secrets_are_kept_encrypted_and_shown_redacted() {
     );
     // A new text has a new version, and a rollback brings the old one back.
     let newer = w.put("Service/slam", spec(json!({ "$secret": "other" }))).await;
-    assert_eq!(
-        newer.spec.pointer("/config/db/password/$secret/version"),
-        Some(&json!(3))
-    );
-    w.service
-        .rollback(&w.admin, &key("Service/slam"), 1, Precondition::None, None)
-        .await
-        .unwrap();
+    assert_eq!(newer.spec.pointer("/config/db/password/$secret/version"), Some(&json!(3)));
+    w.service.rollback(&w.admin, &key("Service/slam"), 1, Precondition::None, None).await.unwrap();
     let clear = w.revealed("Service/slam").await;
-    assert_eq!(
-        clear.spec.pointer("/config/db/password/$secret/text"),
-        Some(&json!(canary))
-    );
+    assert_eq!(clear.spec.pointer("/config/db/password/$secret/text"), Some(&json!(canary)));
     let history = w
         .service
         .history(&w.admin, &key("Service/slam"), None, "", true, &ReadOptions::default())
@@ -516,9 +434,6 @@ async fn a_commit_is_reverted_unless_its_documents_changed_since() {
     assert_eq!(report.revision, 3);
     assert_eq!(w.get("Node/robot-1").await.unwrap().spec, before.spec);
     assert_eq!(code(w.get("Layer/fog").await), Code::NotFound);
-    assert_eq!(
-        code(w.service.revert(&w.admin, 2, false, None).await),
-        Code::RevisionConflict
-    );
+    assert_eq!(code(w.service.revert(&w.admin, 2, false, None).await), Code::RevisionConflict);
     assert_eq!(code(w.service.revert(&w.admin, 99, false, None).await), Code::NotFound);
 }

@@ -10,7 +10,8 @@ use crate::auth::Revocations;
 use crate::secrets::Keyring;
 use crate::store::{SqliteStore, Store, StoreError};
 
-/// A core in development mode on an empty store, with a key for secrets. It lives as long as the supervisor.
+/// A core in development mode on an empty store, with a key for secrets. It lives as long as the
+/// supervisor.
 ///
 /// # Errors
 /// If the store in memory cannot be made.
@@ -28,7 +29,8 @@ pub async fn service_on(
     store: Arc<dyn Store>,
     keys: &[(&str, [u8; 32])],
 ) -> Result<ConfigService, StoreError> {
-    let keyring = Keyring::with_keys(keys).map_err(|error| StoreError::Refused(error.to_string()))?;
+    let keyring =
+        Keyring::with_keys(keys).map_err(|error| StoreError::Refused(error.to_string()))?;
     let options = CoreOptions {
         store,
         authenticator: None,

@@ -1,4 +1,5 @@
-//! What goes in and out of the core. REST and gRPC translate to and from these and decide nothing themselves.
+//! What goes in and out of the core. REST and gRPC translate to and from these and decide nothing
+//! themselves.
 
 use std::net::IpAddr;
 use std::sync::{Arc, OnceLock};

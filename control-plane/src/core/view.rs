@@ -1,4 +1,5 @@
-//! What a token sees and may change: the one place that decides it, for reads and writes of every interface.
+//! What a token sees and may change: the one place that decides it, for reads and writes of every
+//! interface.
 
 use blaze_domain::LayerName;
 use blaze_domain::config::{Code, Document, Key, Kind, Problem};
@@ -16,9 +17,7 @@ pub(crate) struct View {
 
 /// The view of a token.
 pub(crate) fn view(claims: &Claims) -> View {
-    View {
-        layer: claims.layer.clone(),
-    }
+    View { layer: claims.layer.clone() }
 }
 
 /// Refuses what a role does not allow.
@@ -35,8 +34,8 @@ pub(crate) fn authorize(claims: &Claims, right: Right) -> Result<(), Problem> {
     })
 }
 
-/// Refuses what concerns the whole system to all but administrators who are bound to no layer: who may make tokens could
-/// make one that is bound to nothing.
+/// Refuses what concerns the whole system to all but administrators who are bound to no layer: who
+/// may make tokens could make one that is bound to nothing.
 pub(crate) fn authorize_whole(claims: &Claims) -> Result<(), Problem> {
     authorize(claims, Right::Admin)?;
     unbound(claims).map_err(|reason| {
@@ -53,9 +52,7 @@ pub(crate) fn may_reveal(claims: &Claims) -> bool {
 impl View {
     /// What a layer sees.
     pub(crate) fn of_layer(layer: &LayerName) -> Self {
-        Self {
-            layer: Some(layer.clone()),
-        }
+        Self { layer: Some(layer.clone()) }
     }
 
     /// The layer that it is bound to.
@@ -70,9 +67,7 @@ impl View {
 
     /// Whether a document that counts there is seen.
     pub(crate) fn sees(&self, placement: &Placement) -> bool {
-        self.layer
-            .as_ref()
-            .is_none_or(|layer| placement.visible.contains(layer))
+        self.layer.as_ref().is_none_or(|layer| placement.visible.contains(layer))
     }
 
     /// Whether a document is seen.
@@ -80,14 +75,12 @@ impl View {
         self.layer.is_none() || self.sees(&placement(state, document))
     }
 
-    /// Whether the effective configuration at a place may be told of: that of a service or instance that is seen, in the
-    /// layer itself or nowhere in particular.
+    /// Whether the effective configuration at a place may be told of: that of a service or instance
+    /// that is seen, in the layer itself or nowhere in particular.
     pub(crate) fn sees_place(&self, state: &State, at: &At) -> bool {
         let Some(layer) = &self.layer else { return true };
         let sees = |key: &Key| {
-            state
-                .get(key)
-                .is_some_and(|held| self.sees_document(state, &held.document))
+            state.get(key).is_some_and(|held| self.sees_document(state, &held.document))
         };
         let Some(service) = &at.service else {
             return at.layer.as_ref() == Some(layer);
@@ -117,9 +110,15 @@ impl View {
         }
     }
 
-    /// Refuses a key that a write names, if it is outside the view, before anything of it is told. What does not exist
-    /// is outside of every layer where it `must_exist`. Services belong to all layers.
-    pub(crate) fn check_named(&self, state: &State, key: &Key, must_exist: bool) -> Result<(), Problem> {
+    /// Refuses a key that a write names, if it is outside the view, before anything of it is told.
+    /// What does not exist is outside of every layer where it `must_exist`. Services belong to all
+    /// layers.
+    pub(crate) fn check_named(
+        &self,
+        state: &State,
+        key: &Key,
+        must_exist: bool,
+    ) -> Result<(), Problem> {
         if self.layer.is_none() {
             return Ok(());
         }
@@ -134,8 +133,8 @@ impl View {
         }
     }
 
-    /// Refuses a change that reaches beyond the layer that the token is bound to: the document before and after must count
-    /// in that layer alone. Services belong to all layers.
+    /// Refuses a change that reaches beyond the layer that the token is bound to: the document
+    /// before and after must count in that layer alone. Services belong to all layers.
     pub(crate) fn check_write(
         &self,
         (before, was): (&State, Option<&Document>),
@@ -146,7 +145,8 @@ impl View {
             let Some(document) = document else { continue };
             let own = match document.key.kind() {
                 Kind::Service => false,
-                // As if the target itself were changed: one that is placed nowhere counts in other layers too.
+                // As if the target itself were changed: one that is placed nowhere counts in other
+                // layers too.
                 Kind::Rollout => {
                     let target = rollout_target(document).and_then(|key| state.get(&key));
                     target.is_some_and(|target| {
@@ -154,7 +154,8 @@ impl View {
                         place.layer.as_ref() == Some(layer) && place.visible.contains(layer)
                     })
                 }
-                // An instance of a service that the layer does not see is outside too, as if there were no such service.
+                // An instance of a service that the layer does not see is outside too, as if there
+                // were no such service.
                 Kind::Layer | Kind::Node | Kind::Instance => {
                     let placement = placement(state, document);
                     placement.layer.as_ref() == Some(layer) && placement.visible.contains(layer)

@@ -1,4 +1,5 @@
-//! Watches: each has a place in the log and reads on from there; nothing is copied or kept per watcher but that place.
+//! Watches: each has a place in the log and reads on from there; nothing is copied or kept per
+//! watcher but that place.
 //!
 //! ```text
 //! since ─▶ store (commits that the memory no longer has, on the state rebuilt at `since`) ─▶ log ─▶ live
@@ -35,7 +36,8 @@ const MAX_BEHIND: usize = 1000;
 const MAX_BEHIND_BYTES: usize = 8 * 1024 * 1024;
 /// Commits read from the store at once.
 const READ: usize = 256;
-/// Every stream ends by itself after a time in this range, so that load spreads over processes again.
+/// Every stream ends by itself after a time in this range, so that load spreads over processes
+/// again.
 const LIFE: std::ops::Range<u64> = 30 * 60..40 * 60;
 
 /// What a watcher looks at.
@@ -81,15 +83,7 @@ impl Filter {
     }
 
     fn is_everything(&self) -> bool {
-        let Self {
-            kind,
-            name,
-            service,
-            layer,
-            selector,
-            view,
-            as_stored,
-        } = self;
+        let Self { kind, name, service, layer, selector, view, as_stored } = self;
         kind.is_none()
             && name.is_none()
             && service.is_none()
@@ -104,14 +98,8 @@ impl Filter {
         self.kind.is_none_or(|kind| kind == key.kind())
             && self.name.as_ref().is_none_or(|name| name == key.name().as_str())
             && self.service.as_ref().is_none_or(|service| is_of_service(key, service))
-            && self
-                .layer
-                .as_ref()
-                .is_none_or(|layer| is_in_layer(key, placement, layer))
-            && self
-                .selector
-                .as_ref()
-                .is_none_or(|selector| selector.matches(&document.labels))
+            && self.layer.as_ref().is_none_or(|layer| is_in_layer(key, placement, layer))
+            && self.selector.as_ref().is_none_or(|selector| selector.matches(&document.labels))
             && self.view.sees(placement)
     }
 
@@ -125,7 +113,9 @@ impl Filter {
         match (matching(&effect.before), matching(&effect.after)) {
             (None, Some(document)) if effect.before.is_none() => Some((WatchOp::Create, document)),
             (None, Some(document)) => Some((WatchOp::Update, document)),
-            (Some(_), Some(document)) => (!effect.moved_only).then_some((WatchOp::Update, document)),
+            (Some(_), Some(document)) => {
+                (!effect.moved_only).then_some((WatchOp::Update, document))
+            }
             (Some(last), None) if effect.after.is_none() => Some((WatchOp::Delete, last)),
             (Some(last), None) => Some((WatchOp::Leave, last)),
             (None, None) => None,
@@ -226,13 +216,26 @@ impl Watches {
         self.stream(caller, filter, since, life, false)
     }
 
-    /// A stream of what a layer sees, documents as they are stored. It never ends because its reader is slow.
-    pub(crate) fn open_stored(self: &Arc<Self>, caller: &Caller, layer: &LayerName, since: u64) -> WatchStream {
+    /// A stream of what a layer sees, documents as they are stored. It never ends because its
+    /// reader is slow.
+    pub(crate) fn open_stored(
+        self: &Arc<Self>,
+        caller: &Caller,
+        layer: &LayerName,
+        since: u64,
+    ) -> WatchStream {
         let life = rand::rng().random_range(LIFE);
         self.stream(caller, Filter::stored(layer), since, life, true)
     }
 
-    fn stream(self: &Arc<Self>, caller: &Caller, filter: Filter, since: u64, life: u64, patient: bool) -> WatchStream {
+    fn stream(
+        self: &Arc<Self>,
+        caller: &Caller,
+        filter: Filter,
+        since: u64,
+        life: u64,
+        patient: bool,
+    ) -> WatchStream {
         let watcher = Watcher {
             shared: Arc::clone(self),
             everything: filter.is_everything(),
@@ -317,22 +320,22 @@ impl Watcher {
     /// Why the stream must end now.
     fn trouble(&self) -> Option<Problem> {
         if self.shared.ending.is_cancelled() {
-            let detail = "the service is ending; go on with the last id, at another process or soon";
+            let detail =
+                "the service is ending; go on with the last id, at another process or soon";
             return Some(Problem::new(Code::ShuttingDown, detail).retry_after(1));
         }
         let claims = &self.caller.claims;
-        let expired = claims
-            .expires_s
-            .is_some_and(|expires| now().as_millis() / 1000 >= expires);
-        let revoked = claims
-            .token_id
-            .as_ref()
-            .is_some_and(|id| self.shared.revocations.is_revoked(id));
+        let expired = claims.expires_s.is_some_and(|expires| now().as_millis() / 1000 >= expires);
+        let revoked =
+            claims.token_id.as_ref().is_some_and(|id| self.shared.revocations.is_revoked(id));
         if expired || revoked {
             let detail = "the token ran out or was revoked; go on with the last id and a new token";
             return Some(Problem::new(Code::Unauthenticated, detail));
         }
-        if self.live && !self.patient && (self.pending.len() > MAX_BEHIND || self.pending_bytes > MAX_BEHIND_BYTES) {
+        if self.live
+            && !self.patient
+            && (self.pending.len() > MAX_BEHIND || self.pending_bytes > MAX_BEHIND_BYTES)
+        {
             return Some(too_slow());
         }
         None
@@ -412,11 +415,7 @@ impl Watcher {
         };
         for commit in &batch.commits {
             let effects = state.apply(commit.revision, commit.changes.iter().map(Change::step));
-            let previous = if self.everything {
-                commit.revision - 1
-            } else {
-                self.previous
-            };
+            let previous = if self.everything { commit.revision - 1 } else { self.previous };
             let seen = self.filter.commit(commit, &effects, previous).map(Arc::new);
             self.push(commit.revision, seen, super::log::commit_bytes(commit));
         }
@@ -466,7 +465,8 @@ impl Applied {
 
 fn too_slow() -> Problem {
     let detail = format!(
-        "the watcher is more than {MAX_BEHIND} events or {} MiB behind: read faster, or go on with the last id",
+        "the watcher is more than {MAX_BEHIND} events or {} MiB behind: read faster, or go on with \
+         the last id",
         MAX_BEHIND_BYTES / (1024 * 1024)
     );
     Problem::new(Code::WatchTooSlow, detail)
@@ -474,8 +474,10 @@ fn too_slow() -> Problem {
 
 /// The refusal of a revision that the history does not have any more.
 pub(crate) fn trimmed(floor: u64, revision: u64) -> Problem {
-    let detail =
-        format!("the history reaches back to revision {floor}: list again, then watch from the list's revision");
+    let detail = format!(
+        "the history reaches back to revision {floor}: list again, then watch from the list's \
+         revision"
+    );
     let mut problem = Problem::new(Code::RevisionTrimmed, detail).at(revision);
     problem.oldest_revision = Some(floor);
     problem

@@ -1,5 +1,5 @@
-//! The workers that are known: which are connected here, and what they said they have. It lives outside of the revision
-//! and is gone with the process; a worker says it anew when it comes back.
+//! The workers that are known: which are connected here, and what they said they have. It lives
+//! outside of the revision and is gone with the process; a worker says it anew when it comes back.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
@@ -9,7 +9,8 @@ use blaze_domain::config::Timestamp;
 use blaze_domain::{InstanceName, LayerName, NodeName, ServiceName};
 use parking_lot::Mutex;
 
-/// Workers that are remembered, at most; of those that have gone the ones seen longest ago give way.
+/// Workers that are remembered, at most; of those that have gone the ones seen longest ago give
+/// way.
 const MAX_WORKERS: usize = 10_000;
 /// Running instances that one worker may tell of; what is beyond is not kept.
 const MAX_SERVICES: usize = 10_000;
@@ -73,10 +74,7 @@ impl RolloutReport {
             return None;
         }
         let reason = self.reason.chars().filter(|letter| !letter.is_control());
-        Some(Self {
-            reason: reason.take(MAX_REASON).collect(),
-            ..self
-        })
+        Some(Self { reason: reason.take(MAX_REASON).collect(), ..self })
     }
 }
 
@@ -183,18 +181,14 @@ impl Workers {
         if known.workers.len() >= MAX_WORKERS && !known.workers.contains_key(&name) {
             known.forget_one()?;
         }
-        // Each life of a worker has another name: of those that have gone on this node, this is the next life.
-        known
-            .workers
-            .retain(|other, worker| worker.is_connected() || (&other.layer, &other.node) != (&name.layer, &name.node));
+        // Each life of a worker has another name: of those that have gone on this node, this is the
+        // next life.
+        known.workers.retain(|other, worker| {
+            worker.is_connected() || (&other.layer, &other.node) != (&name.layer, &name.node)
+        });
         known.connections += 1;
         let connection = known.connections;
-        let worker = Worker {
-            version,
-            connection: Some(connection),
-            last_seen: now,
-            has,
-        };
+        let worker = Worker { version, connection: Some(connection), last_seen: now, has };
         known.workers.insert(name.clone(), worker);
         Ok(WorkerSession {
             workers: Arc::clone(self),
@@ -211,8 +205,9 @@ impl Workers {
         workers.map(|(name, worker)| (name.clone(), worker.clone())).collect()
     }
 
-    /// What is said of a roll-out, by node, with the layer of the worker that says it. The node's own worker knows best, then
-    /// one that is connected, then one for which it failed, then the one that was heard last.
+    /// What is said of a roll-out, by node, with the layer of the worker that says it. The node's
+    /// own worker knows best, then one that is connected, then one for which it failed, then the
+    /// one that was heard last.
     pub(crate) fn of_rollout(&self, uid: &str) -> BTreeMap<NodeName, (LayerName, Told)> {
         let known = self.known.lock();
         let mut best: BTreeMap<NodeName, (_, LayerName, Told)> = BTreeMap::new();
@@ -232,18 +227,14 @@ impl Workers {
                 }
             }
         }
-        best.into_iter()
-            .map(|(node, (_, layer, told))| (node, (layer, told)))
-            .collect()
+        best.into_iter().map(|(node, (_, layer, told))| (node, (layer, told))).collect()
     }
 }
 
 impl Known {
     fn forget_one(&mut self) -> Result<(), TooMany> {
         let gone = self.workers.iter().filter(|(_, worker)| !worker.is_connected());
-        let oldest = gone
-            .min_by_key(|(_, worker)| worker.last_seen)
-            .map(|(name, _)| name.clone());
+        let oldest = gone.min_by_key(|(_, worker)| worker.last_seen).map(|(name, _)| name.clone());
         self.workers.remove(&oldest.ok_or(TooMany)?);
         Ok(())
     }
@@ -310,9 +301,7 @@ mod tests {
     fn the_newest_connection_of_a_worker_counts() {
         let workers = Arc::new(Workers::default());
         let enter = |second| {
-            workers
-                .enter(name("w"), "1".into(), Acknowledged::default(), at(second))
-                .unwrap()
+            workers.enter(name("w"), "1".into(), Acknowledged::default(), at(second)).unwrap()
         };
         let (old, new) = (enter(1), enter(2));
         old.said(Acknowledged::new(7, "old".into(), [], []), at(3));
@@ -331,11 +320,8 @@ mod tests {
     #[test]
     fn the_next_life_of_a_worker_takes_the_place_of_the_last() {
         let workers = Arc::new(Workers::default());
-        let enter = |id| {
-            workers
-                .enter(name(id), String::new(), Acknowledged::default(), at(1))
-                .unwrap()
-        };
+        let enter =
+            |id| workers.enter(name(id), String::new(), Acknowledged::default(), at(1)).unwrap();
         let (first, beside) = (enter("a"), enter("b"));
         drop(first);
         let _next = enter("c");

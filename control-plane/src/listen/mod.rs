@@ -4,8 +4,9 @@
 //! accept ─(limit)─▶ TLS handshake ─(10 s)─▶ HTTP ─(first request: 30 s)─▶ unread bodies ─▶ Router
 //! ```
 //!
-//! `axum-server` accepts, serves and drains; hyper bounds heads and HTTP/2. This module adds what both leave open: the
-//! number of connections, silence before the first request, clients that do not read, and bodies that nobody reads.
+//! `axum-server` accepts, serves and drains; hyper bounds heads and HTTP/2. This module adds what
+//! both leave open: the number of connections, silence before the first request, clients that do
+//! not read, and bodies that nobody reads.
 
 mod socket;
 #[cfg(test)]
@@ -34,11 +35,11 @@ use unread::Reader;
 
 pub use tls::{Tls, install_crypto_provider};
 
-/// Lines of a head of HTTP/1.1; one with more is answered 431 by the library, without a body. What has fewer lines and too
-/// many bytes reaches the router.
+/// Lines of a head of HTTP/1.1; one with more is answered 431 by the library, without a body. What
+/// has fewer lines and too many bytes reaches the router.
 const MAX_HEADER_LINES: usize = 1024;
-/// Bytes of a head beyond which the library answers 431. Twice what the contract allows, so that the refusal of the router
-/// can have its form.
+/// Bytes of a head beyond which the library answers 431. Twice what the contract allows, so that
+/// the refusal of the router can have its form.
 const MAX_HEAD_BYTES: u32 = 64 * 1024;
 /// Requests at once on one connection of HTTP/2.
 const MAX_STREAMS: u32 = 1000;
@@ -94,7 +95,8 @@ impl Default for ListenLimits {
     }
 }
 
-/// The connection that a request came on. In the extensions of every request, beside `ConnectInfo<SocketAddr>`.
+/// The connection that a request came on. In the extensions of every request, beside
+/// `ConnectInfo<SocketAddr>`.
 #[derive(Debug, Clone)]
 pub struct Peer {
     /// Whether the connection is encrypted.
@@ -114,8 +116,8 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Binds the port (0: any). `name` is that in metrics and logs: `rest`, `grpc`. Without `tls` it speaks plaintext;
-    /// whether that is allowed was settled before.
+    /// Binds the port (0: any). `name` is that in metrics and logs: `rest`, `grpc`. Without `tls`
+    /// it speaks plaintext; whether that is allowed was settled before.
     ///
     /// # Errors
     /// If the address cannot be bound.
@@ -126,17 +128,12 @@ impl Listener {
         protocols: Protocols,
         limits: ListenLimits,
     ) -> io::Result<Self> {
-        let describe = |error: io::Error| io::Error::new(error.kind(), format!("{name} port {address}: {error}"));
+        let describe = |error: io::Error| {
+            io::Error::new(error.kind(), format!("{name} port {address}: {error}"))
+        };
         let listener = TcpListener::bind(address).await.map_err(describe)?;
         let address = listener.local_addr().map_err(describe)?;
-        Ok(Self {
-            name,
-            listener,
-            address,
-            tls,
-            protocols,
-            limits: Arc::new(limits),
-        })
+        Ok(Self { name, listener, address, tls, protocols, limits: Arc::new(limits) })
     }
 
     /// The address with the real port.
@@ -149,10 +146,7 @@ impl Listener {
     pub fn serve(self, supervisor: &Supervisor, router: Router, metrics: &ApiMetrics) -> Serving {
         let (name, address) = (self.name, self.address);
         let (drain, handle) = (self.limits.drain_timeout, Handle::new());
-        let reader = Reader {
-            limits: Arc::clone(&self.limits),
-            supervisor: supervisor.clone(),
-        };
+        let reader = Reader { limits: Arc::clone(&self.limits), supervisor: supervisor.clone() };
         let app = router
             .layer(middleware::from_fn_with_state(reader, unread::read_on))
             .into_make_service_with_connect_info::<SocketAddr>();
@@ -169,7 +163,11 @@ impl Listener {
             let ended = served.await;
             let left = handle.connection_count();
             if left > 0 {
-                tracing::warn!(port = name, left, "connections are cut: their requests did not end");
+                tracing::warn!(
+                    port = name,
+                    left,
+                    "connections are cut: their requests did not end"
+                );
             }
             ended
         };
@@ -180,9 +178,10 @@ impl Listener {
     fn server(self, metrics: &ApiMetrics, stop: CancellationToken) -> Server<SocketAddr, Acceptor> {
         let (limits, protocols) = (self.limits, self.protocols);
         let acceptor = Acceptor {
-            tls: self
-                .tls
-                .map(|tls| RustlsAcceptor::new(tls.config(protocols)).handshake_timeout(limits.handshake_timeout)),
+            tls: self.tls.map(|tls| {
+                RustlsAcceptor::new(tls.config(protocols))
+                    .handshake_timeout(limits.handshake_timeout)
+            }),
             places: Arc::new(Semaphore::new(limits.connections)),
             limits: Arc::clone(&limits),
             metrics: metrics.connections(self.name),
@@ -196,7 +195,8 @@ impl Listener {
             .header_read_timeout(limits.head_timeout)
             .max_headers(MAX_HEADER_LINES)
             .max_buf_size(MAX_HEAD_BYTES as usize);
-        // A head that does not end holds up the answer to a PING: the keep-alive is its limit of time.
+        // A head that does not end holds up the answer to a PING: the keep-alive is its limit of
+        // time.
         builder
             .http2()
             .timer(TokioTimer::new())
@@ -227,8 +227,8 @@ impl Serving {
         self.address
     }
 
-    /// Takes no more connections, and no more requests on those that are open. For the process as a whole only: before
-    /// its shutdown began this counts as a failure.
+    /// Takes no more connections, and no more requests on those that are open. For the process as a
+    /// whole only: before its shutdown began this counts as a failure.
     pub fn stop(&self) {
         self.stop.cancel();
     }

@@ -43,10 +43,7 @@ impl<S: Send + 'static> Accept<TcpStream, S> for Acceptor {
     fn accept(&self, stream: TcpStream, service: S) -> Self::Future {
         let acceptor = self.clone();
         Box::pin(async move {
-            let peer = Peer {
-                encrypted: acceptor.tls.is_some(),
-                has_asked: Arc::default(),
-            };
+            let peer = Peer { encrypted: acceptor.tls.is_some(), has_asked: Arc::default() };
             let socket = acceptor.socket(stream, Arc::clone(&peer.has_asked))?;
             let Some(tls) = acceptor.tls else {
                 return Ok((Either::Left(socket), Extension(peer).layer(service)));
@@ -72,7 +69,8 @@ impl Acceptor {
         self.metrics.count("accepted");
         // Small answers go at once.
         stream.set_nodelay(true)?;
-        // The kernel ends a connection whose client acknowledges nothing, or leaves its window closed.
+        // The kernel ends a connection whose client acknowledges nothing, or leaves its window
+        // closed.
         SockRef::from(&stream).set_tcp_user_timeout(Some(self.limits.write_stall))?;
         let stopped = self.stop.clone().cancelled_owned();
         Ok(Socket {
@@ -89,8 +87,8 @@ impl Acceptor {
     }
 }
 
-/// The stream below TLS. It breaks when no first request comes, which hyper does not bound before it knows the version of
-/// HTTP, nor in the handshake of HTTP/2.
+/// The stream below TLS. It breaks when no first request comes, which hyper does not bound before
+/// it knows the version of HTTP, nor in the handshake of HTTP/2.
 pub(super) struct Socket {
     stream: TcpStream,
     has_asked: Arc<AtomicBool>,
@@ -105,7 +103,9 @@ impl Socket {
         if self.has_asked.load(Ordering::Relaxed) {
             self.silence = None;
         }
-        let Some(Poll::Ready(timed_out)) = self.silence.as_mut().map(|silence| silence.poll_unpin(context)) else {
+        let Some(Poll::Ready(timed_out)) =
+            self.silence.as_mut().map(|silence| silence.poll_unpin(context))
+        else {
             return false;
         };
         self.silence = None;
@@ -141,7 +141,11 @@ impl AsyncRead for Socket {
 }
 
 impl AsyncWrite for Socket {
-    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.stream).poll_write(context, bytes);
         self.counted(written)
     }

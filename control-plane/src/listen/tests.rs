@@ -47,9 +47,7 @@ fn router(began: &Arc<Notify>, go: &Arc<Notify>) -> Router {
         "waited"
     };
     let endless = || async {
-        Body::from_stream(stream::repeat_with(|| {
-            Ok::<_, Infallible>(Bytes::from(vec![7; 65_536]))
-        }))
+        Body::from_stream(stream::repeat_with(|| Ok::<_, Infallible>(Bytes::from(vec![7; 65_536]))))
     };
     let peer = |ConnectInfo(address): ConnectInfo<SocketAddr>, Extension(peer): Extension<Peer>| async move {
         assert!(address.ip().is_loopback());
@@ -75,13 +73,7 @@ async fn serve_with(limits: ListenLimits, protocols: Protocols, tls: Option<Tls>
     let listener = Listener::bind("rest", any, tls, protocols, limits).await.unwrap();
     let (metrics, began, go) = (ApiMetrics::new().unwrap(), Arc::default(), Arc::default());
     let serving = listener.serve(&supervisor, router(&began, &go), &metrics);
-    Served {
-        supervisor,
-        serving,
-        metrics,
-        began,
-        go,
-    }
+    Served { supervisor, serving, metrics, began, go }
 }
 
 async fn serve(limits: ListenLimits) -> Served {
@@ -115,11 +107,7 @@ impl Served {
             }
         };
         let found = tokio::time::timeout(SOON, reached).await;
-        assert!(
-            found.is_ok(),
-            "{result} does not reach {least}: {}",
-            self.metrics.text()
-        );
+        assert!(found.is_ok(), "{result} does not reach {least}: {}", self.metrics.text());
     }
 
     async fn end(self) {
@@ -137,11 +125,7 @@ impl Served {
 async fn read_all(stream: &mut (impl AsyncRead + Unpin)) -> String {
     let mut answer = Vec::new();
     let read = tokio::time::timeout(SOON, stream.read_to_end(&mut answer)).await;
-    assert!(
-        read.is_ok(),
-        "the port does not close: {}",
-        String::from_utf8_lossy(&answer)
-    );
+    assert!(read.is_ok(), "the port does not close: {}", String::from_utf8_lossy(&answer));
     String::from_utf8_lossy(&answer).into_owned()
 }
 
@@ -157,9 +141,8 @@ async fn http2_client<S>(stream: S, supervisor: &Supervisor) -> Sender
 where
     S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
-    let (sender, connection) = http2::handshake(TokioExecutor::new(), TokioIo::new(stream))
-        .await
-        .unwrap();
+    let (sender, connection) =
+        http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await.unwrap();
     supervisor.spawn("client", TaskPolicy::MayEnd, async move {
         let _ = connection.await;
     });
@@ -167,9 +150,7 @@ where
 }
 
 fn request(path: &str) -> Request<Empty<Bytes>> {
-    Request::get(format!("http://localhost{path}"))
-        .body(Empty::new())
-        .unwrap()
+    Request::get(format!("http://localhost{path}")).body(Empty::new()).unwrap()
 }
 
 #[tokio::test]
@@ -195,20 +176,14 @@ async fn a_port_for_http2_takes_nothing_else() {
     let answer = ask(&mut served.connect().await, GET).await;
     assert!(!answer.contains("200 OK"), "{answer}");
     let mut sender = http2_client(served.connect().await, &served.supervisor).await;
-    assert_eq!(
-        sender.send_request(request("/")).await.unwrap().status(),
-        StatusCode::OK
-    );
+    assert_eq!(sender.send_request(request("/")).await.unwrap().status(), StatusCode::OK);
     drop(sender);
     served.end().await;
 }
 
 #[tokio::test]
 async fn connections_over_the_limit_are_closed_and_counted() {
-    let limits = ListenLimits {
-        connections: 1,
-        ..ListenLimits::default()
-    };
+    let limits = ListenLimits { connections: 1, ..ListenLimits::default() };
     let served = serve(limits).await;
     let mut first = served.connect().await;
     first.write_all(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n").await.unwrap();
@@ -218,7 +193,8 @@ async fn connections_over_the_limit_are_closed_and_counted() {
     assert_eq!(served.count("refused"), 1);
     drop(first);
     // It takes a moment until the place is free.
-    let answered = async { while !ask(&mut served.connect().await, GET).await.starts_with("HTTP/1.1 200") {} };
+    let answered =
+        async { while !ask(&mut served.connect().await, GET).await.starts_with("HTTP/1.1 200") {} };
     tokio::time::timeout(SOON, answered).await.unwrap();
     served.end().await;
 }
@@ -233,7 +209,8 @@ async fn large_heads_reach_the_router_and_larger_ones_are_431() {
         );
         let answer = ask(&mut served.connect().await, head.as_bytes()).await;
         // What is not read when it closes can take the answer with it.
-        let expected = answer.starts_with(&format!("HTTP/1.1 {status}")) || (status == "431" && answer.is_empty());
+        let expected = answer.starts_with(&format!("HTTP/1.1 {status}"))
+            || (status == "431" && answer.is_empty());
         assert!(expected, "{bytes}: {answer}");
     }
     served.end().await;
@@ -274,9 +251,8 @@ async fn who_sends_everything_first_gets_its_answer() {
 #[tokio::test]
 async fn a_stream_that_was_refused_early_is_not_reset_while_its_body_comes() {
     let served = serve(ListenLimits::default()).await;
-    let (mut sender, connection) = http2::handshake(TokioExecutor::new(), TokioIo::new(served.connect().await))
-        .await
-        .unwrap();
+    let (mut sender, connection) =
+        http2::handshake(TokioExecutor::new(), TokioIo::new(served.connect().await)).await.unwrap();
     served.supervisor.spawn("client", TaskPolicy::MayEnd, async move {
         let _ = connection.await;
     });
@@ -287,14 +263,9 @@ async fn a_stream_that_was_refused_early_is_not_reset_while_its_body_comes() {
             whole.map(|whole| whole.send(()));
             return None;
         }
-        Some((
-            Ok::<_, Infallible>(Bytes::from(vec![b'x'; 65_536])),
-            (at + 65_536, whole),
-        ))
+        Some((Ok::<_, Infallible>(Bytes::from(vec![b'x'; 65_536])), (at + 65_536, whole)))
     });
-    let request = Request::post("http://localhost/refuse")
-        .body(Body::from_stream(parts))
-        .unwrap();
+    let request = Request::post("http://localhost/refuse").body(Body::from_stream(parts)).unwrap();
     let answer = sender.send_request(request).await.unwrap();
     assert_eq!(answer.status(), StatusCode::PAYLOAD_TOO_LARGE);
     tokio::time::timeout(SOON, sent).await.unwrap().unwrap();
@@ -304,11 +275,8 @@ async fn a_stream_that_was_refused_early_is_not_reset_while_its_body_comes() {
 
 #[tokio::test]
 async fn a_body_that_does_not_end_is_not_read_for_ever() {
-    let limits = ListenLimits {
-        unread_bytes: 1024 * 1024,
-        unread_time: SHORT,
-        ..ListenLimits::default()
-    };
+    let limits =
+        ListenLimits { unread_bytes: 1024 * 1024, unread_time: SHORT, ..ListenLimits::default() };
     let served = serve(limits).await;
     let mut slow = served.connect().await;
     slow.write_all(b"POST /refuse HTTP/1.1\r\nhost: x\r\ncontent-length: 9\r\n\r\nx")
@@ -328,7 +296,8 @@ async fn a_body_that_does_not_end_is_not_read_for_ever() {
 async fn who_waits_to_be_asked_for_a_body_is_not_asked() {
     let served = serve(ListenLimits::default()).await;
     let mut stream = served.connect().await;
-    let head = b"POST /refuse HTTP/1.1\r\nhost: x\r\nexpect: 100-continue\r\ncontent-length: 9\r\n\r\n";
+    let head =
+        b"POST /refuse HTTP/1.1\r\nhost: x\r\nexpect: 100-continue\r\ncontent-length: 9\r\n\r\n";
     let answer = ask(&mut stream, head).await;
     assert!(answer.starts_with("HTTP/1.1 413"), "{answer}");
     served.end().await;
@@ -336,10 +305,7 @@ async fn who_waits_to_be_asked_for_a_body_is_not_asked() {
 
 #[tokio::test]
 async fn slow_heads_and_silence_end_the_connection() {
-    let limits = ListenLimits {
-        head_timeout: SHORT,
-        ..ListenLimits::default()
-    };
+    let limits = ListenLimits { head_timeout: SHORT, ..ListenLimits::default() };
     let served = serve(limits).await;
     for start in [&b""[..], b"GET / HT", b"PRI * HTTP/2.0\r\n"] {
         let mut stream = served.connect().await;
@@ -388,16 +354,10 @@ async fn a_head_of_http2_that_does_not_end_is_ended_by_the_keep_alive() {
 
 #[tokio::test]
 async fn a_client_that_does_not_read_loses_its_connection() {
-    let limits = ListenLimits {
-        write_stall: SHORT,
-        ..ListenLimits::default()
-    };
+    let limits = ListenLimits { write_stall: SHORT, ..ListenLimits::default() };
     let served = serve(limits).await;
     let mut stream = served.connect().await;
-    stream
-        .write_all(b"GET /endless HTTP/1.1\r\nhost: x\r\n\r\n")
-        .await
-        .unwrap();
+    stream.write_all(b"GET /endless HTTP/1.1\r\nhost: x\r\n\r\n").await.unwrap();
     served.counted("stalled", 1).await;
     drop(stream);
     served.end().await;
@@ -407,10 +367,7 @@ async fn a_client_that_does_not_read_loses_its_connection() {
 async fn stopping_lets_requests_end() {
     let served = serve(ListenLimits::default()).await;
     let mut waiting = served.connect().await;
-    waiting
-        .write_all(b"GET /wait HTTP/1.1\r\nhost: x\r\n\r\n")
-        .await
-        .unwrap();
+    waiting.write_all(b"GET /wait HTTP/1.1\r\nhost: x\r\n\r\n").await.unwrap();
     served.began.notified().await;
     let mut sender = http2_client(served.connect().await, &served.supervisor).await;
     let also_waiting = sender.send_request(request("/wait"));
@@ -428,10 +385,7 @@ async fn stopping_lets_requests_end() {
         report
     };
     let (answer, report) = tokio::join!(also_waiting, stopping);
-    assert_eq!(
-        answer.unwrap().into_body().collect().await.unwrap().to_bytes(),
-        "waited"
-    );
+    assert_eq!(answer.unwrap().into_body().collect().await.unwrap().to_bytes(), "waited");
     assert!(read_all(&mut waiting).await.ends_with("waited"));
     assert!(report.is_clean(), "{report:?}");
     served.serving.drained().await;
@@ -440,16 +394,10 @@ async fn stopping_lets_requests_end() {
 
 #[tokio::test]
 async fn what_does_not_end_is_cut_at_the_deadline() {
-    let limits = ListenLimits {
-        drain_timeout: SHORT,
-        ..ListenLimits::default()
-    };
+    let limits = ListenLimits { drain_timeout: SHORT, ..ListenLimits::default() };
     let served = serve(limits).await;
     let mut waiting = served.connect().await;
-    waiting
-        .write_all(b"GET /wait HTTP/1.1\r\nhost: x\r\n\r\n")
-        .await
-        .unwrap();
+    waiting.write_all(b"GET /wait HTTP/1.1\r\nhost: x\r\n\r\n").await.unwrap();
     served.began.notified().await;
     served.end().await;
     assert_eq!(read_all(&mut waiting).await, "");
@@ -462,10 +410,7 @@ async fn a_panic_ends_its_request_alone() {
     assert_eq!(answer, "");
     let mut sender = http2_client(served.connect().await, &served.supervisor).await;
     assert!(sender.send_request(request("/panic")).await.is_err());
-    assert_eq!(
-        sender.send_request(request("/")).await.unwrap().status(),
-        StatusCode::OK
-    );
+    assert_eq!(sender.send_request(request("/")).await.unwrap().status(), StatusCode::OK);
     drop(sender);
     served.end().await;
 }
@@ -495,7 +440,8 @@ impl Authority {
     fn sign(&self, name: &str) -> CertificateDer<'static> {
         let key = KeyPair::generate().unwrap();
         let mut params = CertificateParams::new(vec!["localhost".to_owned()]).unwrap();
-        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        params.extended_key_usages =
+            vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
         let certificate = params.signed_by(&key, &self.issuer).unwrap();
         fs::write(self.path(&format!("{name}.key")), key.serialize_pem()).unwrap();
         fs::write(self.path(&format!("{name}.pem")), certificate.pem()).unwrap();
@@ -516,11 +462,14 @@ impl Authority {
     }
 
     /// A client that trusts this authority and shows the certificate of that name.
-    async fn client(&self, served: &Served, own: Option<&str>, alpn: &[&str]) -> io::Result<TlsStream<TcpStream>> {
+    async fn client(
+        &self,
+        served: &Served,
+        own: Option<&str>,
+        alpn: &[&str],
+    ) -> io::Result<TlsStream<TcpStream>> {
         let mut roots = RootCertStore::empty();
-        roots
-            .add(CertificateDer::from_pem_file(self.path("ca.pem")).unwrap())
-            .unwrap();
+        roots.add(CertificateDer::from_pem_file(self.path("ca.pem")).unwrap()).unwrap();
         let builder = ClientConfig::builder_with_provider(Arc::new(default_provider()))
             .with_safe_default_protocol_versions()
             .unwrap()
@@ -528,16 +477,15 @@ impl Authority {
         let mut config = match own {
             None => builder.with_no_client_auth(),
             Some(name) => {
-                let chain = vec![CertificateDer::from_pem_file(self.path(&format!("{name}.pem"))).unwrap()];
+                let chain =
+                    vec![CertificateDer::from_pem_file(self.path(&format!("{name}.pem"))).unwrap()];
                 let key = PrivateKeyDer::from_pem_file(self.path(&format!("{name}.key"))).unwrap();
                 builder.with_client_auth_cert(chain, key).unwrap()
             }
         };
         config.alpn_protocols = alpn.iter().map(|name| name.as_bytes().to_vec()).collect();
         let name = ServerName::try_from("localhost").unwrap();
-        TlsConnector::from(Arc::new(config))
-            .connect(name, served.connect().await)
-            .await
+        TlsConnector::from(Arc::new(config)).connect(name, served.connect().await).await
     }
 }
 
@@ -549,24 +497,23 @@ fn shown(stream: &TlsStream<TcpStream>) -> CertificateDer<'static> {
 async fn tls_speaks_what_alpn_says() {
     let authority = Authority::new();
     authority.sign("server");
-    let both = serve_with(ListenLimits::default(), Protocols::Both, Some(authority.tls(false))).await;
+    let both =
+        serve_with(ListenLimits::default(), Protocols::Both, Some(authority.tls(false))).await;
     let mut stream = authority.client(&both, None, &["http/1.1"]).await.unwrap();
     let answer = ask(&mut stream, GET).await;
     assert!(answer.ends_with("encrypted=true"), "{answer}");
     let stream = authority.client(&both, None, &["h2", "http/1.1"]).await.unwrap();
     assert_eq!(stream.get_ref().1.alpn_protocol(), Some(&b"h2"[..]));
     let mut sender = http2_client(stream, &both.supervisor).await;
-    assert_eq!(
-        sender.send_request(request("/")).await.unwrap().status(),
-        StatusCode::OK
-    );
+    assert_eq!(sender.send_request(request("/")).await.unwrap().status(), StatusCode::OK);
     drop(sender);
     // No TLS at all.
     let answer = ask(&mut both.connect().await, GET).await;
     assert!(!answer.contains("HTTP"), "{answer}");
     both.counted("handshake_failed", 1).await;
     both.end().await;
-    let http2 = serve_with(ListenLimits::default(), Protocols::Http2, Some(authority.tls(false))).await;
+    let http2 =
+        serve_with(ListenLimits::default(), Protocols::Http2, Some(authority.tls(false))).await;
     assert!(authority.client(&http2, None, &["http/1.1"]).await.is_err());
     http2.end().await;
 }
@@ -575,10 +522,7 @@ async fn tls_speaks_what_alpn_says() {
 async fn a_handshake_must_not_take_long() {
     let authority = Authority::new();
     authority.sign("server");
-    let limits = ListenLimits {
-        handshake_timeout: SHORT,
-        ..ListenLimits::default()
-    };
+    let limits = ListenLimits { handshake_timeout: SHORT, ..ListenLimits::default() };
     let served = serve_with(limits, Protocols::Both, Some(authority.tls(false))).await;
     assert_eq!(read_all(&mut served.connect().await).await, "");
     served.counted("handshake_timeout", 1).await;
@@ -594,7 +538,8 @@ async fn where_clients_need_certificates_others_are_refused() {
     // Another authority's certificate; the stranger trusts the server all the same.
     stranger.sign("client");
     fs::copy(authority.path("ca.pem"), stranger.path("ca.pem")).unwrap();
-    let served = serve_with(ListenLimits::default(), Protocols::Both, Some(authority.tls(true))).await;
+    let served =
+        serve_with(ListenLimits::default(), Protocols::Both, Some(authority.tls(true))).await;
     let mut stream = authority.client(&served, Some("client"), &["http/1.1"]).await.unwrap();
     let answer = ask(&mut stream, GET).await;
     assert!(answer.ends_with("encrypted=true"), "{answer}");

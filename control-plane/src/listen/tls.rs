@@ -17,7 +17,8 @@ use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 use super::Protocols;
 use crate::reload::{self, read_file, watch_files};
 
-/// Makes aws-lc-rs the cryptography of every TLS connection of this process. First thing in `main`; again is harmless.
+/// Makes aws-lc-rs the cryptography of every TLS connection of this process. First thing in `main`;
+/// again is harmless.
 pub fn install_crypto_provider() {
     // An error says that there is one already.
     let _ = default_provider().install_default();
@@ -53,34 +54,26 @@ impl Tls {
             client_authorities: section.client_ca_file.clone(),
         };
         let [both, http2] = files.read()?.map(RustlsConfig::from_config);
-        Ok(Some(Self {
-            files: Arc::new(files),
-            both,
-            http2,
-        }))
+        Ok(Some(Self { files: Arc::new(files), both, http2 }))
     }
 
-    /// Reads the files again when they change. Connections that are open stay; if the files are faulty, what held before
-    /// holds on.
+    /// Reads the files again when they change. Connections that are open stay; if the files are
+    /// faulty, what held before holds on.
     pub fn watch(&self, supervisor: &Supervisor) {
         self.watch_every(supervisor, reload::PERIOD);
     }
 
     pub(super) fn watch_every(&self, supervisor: &Supervisor, period: Duration) {
         let files = &self.files;
-        let paths = [&files.certificate, &files.key]
-            .into_iter()
-            .chain(&files.client_authorities);
+        let paths = [&files.certificate, &files.key].into_iter().chain(&files.client_authorities);
         let (paths, tls) = (paths.cloned().collect(), self.clone());
-        watch_files(supervisor, "certificates", paths, period, move || {
-            match tls.files.read() {
-                Ok([both, http2]) => {
-                    tls.both.reload_from_config(both);
-                    tls.http2.reload_from_config(http2);
-                    Vec::new()
-                }
-                Err(faults) => faults,
+        watch_files(supervisor, "certificates", paths, period, move || match tls.files.read() {
+            Ok([both, http2]) => {
+                tls.both.reload_from_config(both);
+                tls.http2.reload_from_config(http2);
+                Vec::new()
             }
+            Err(faults) => faults,
         });
     }
 
@@ -104,10 +97,11 @@ impl Files {
         let key = private_key(&self.key).map_err(at("key_file"));
         let authorities = self.client_authorities.as_deref().map(authorities).transpose();
         match (chain, key, authorities.map_err(at("client_ca_file"))) {
-            (Ok(chain), Ok(key), Ok(clients)) => {
-                build(chain, key, clients).map_err(|fault| vec![at("cert_file")(self.mismatch(&fault))])
+            (Ok(chain), Ok(key), Ok(clients)) => build(chain, key, clients)
+                .map_err(|fault| vec![at("cert_file")(self.mismatch(&fault))]),
+            (chain, key, clients) => {
+                Err([chain.err(), key.err(), clients.err()].into_iter().flatten().collect())
             }
-            (chain, key, clients) => Err([chain.err(), key.err(), clients.err()].into_iter().flatten().collect()),
         }
     }
 
@@ -129,9 +123,7 @@ fn build(
         None => builder.with_no_client_auth(),
         Some(verifier) => builder.with_client_cert_verifier(verifier),
     };
-    let mut both = builder
-        .with_single_cert(chain, key)
-        .map_err(|error| error.to_string())?;
+    let mut both = builder.with_single_cert(chain, key).map_err(|error| error.to_string())?;
     let mut http2 = both.clone();
     both.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
     http2.alpn_protocols = vec![b"h2".to_vec()];
@@ -143,7 +135,9 @@ fn authorities(path: &Path) -> Result<Arc<dyn ClientCertVerifier>, String> {
     let mut roots = RootCertStore::empty();
     for certificate in certificates(path)? {
         let added = roots.add(certificate);
-        added.map_err(|error| format!("{}: no certificate of an authority: {error}", path.display()))?;
+        added.map_err(|error| {
+            format!("{}: no certificate of an authority: {error}", path.display())
+        })?;
     }
     let provider = Arc::new(default_provider());
     let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
@@ -155,7 +149,9 @@ fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, String> {
     let text = read_file(path)?;
     let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&text).collect();
     match found {
-        Ok(found) if found.is_empty() => Err(format!("{} holds no certificate in PEM form", path.display())),
+        Ok(found) if found.is_empty() => {
+            Err(format!("{} holds no certificate in PEM form", path.display()))
+        }
         Ok(found) => Ok(found),
         Err(error) => Err(format!("{} is no PEM file: {error}", path.display())),
     }
@@ -164,5 +160,6 @@ fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, String> {
 fn private_key(path: &Path) -> Result<PrivateKeyDer<'static>, String> {
     let text = read_file(path)?;
     // The text of the fault could hold a part of the key.
-    PrivateKeyDer::from_pem_slice(&text).map_err(|_| format!("{} holds no private key in PEM form", path.display()))
+    PrivateKeyDer::from_pem_slice(&text)
+        .map_err(|_| format!("{} holds no private key in PEM form", path.display()))
 }

@@ -5,8 +5,9 @@
 //!    body ──────┘ └ dropped before its end: read on for a while, and thrown away
 //! ```
 //!
-//! A client that sends everything before it reads would lose the answer, a 413 above all: over HTTP/1.1 the connection
-//! would be reset. So the rest is read, up to a number of bytes and for a time.
+//! A client that sends everything before it reads would lose the answer, a 413 above all: over
+//! HTTP/1.1 the connection would be reset. So the rest is read, up to a number of bytes and for a
+//! time.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -31,7 +32,11 @@ pub(super) struct Reader {
 }
 
 /// The first middleware of a request.
-pub(super) async fn read_on(State(reader): State<Reader>, request: Request, next: Next) -> Response {
+pub(super) async fn read_on(
+    State(reader): State<Reader>,
+    request: Request,
+    next: Next,
+) -> Response {
     if let Some(peer) = request.extensions().get::<Peer>() {
         peer.has_asked.store(true, Ordering::Relaxed);
     }
@@ -44,11 +49,7 @@ impl Reader {
         if body.is_end_stream() {
             return body;
         }
-        let rest = Rest {
-            body,
-            waits,
-            reader: self,
-        };
+        let rest = Rest { body, waits, reader: self };
         Body::new(StreamBody::new(stream::unfold(rest, |mut rest| async {
             rest.waits = false;
             let frame = rest.body.frame().await;
@@ -79,9 +80,7 @@ impl Drop for Rest {
             // Over the time it is dropped, as it would have been at once.
             let _ = tokio::time::timeout(limits.unread_time, read(body, limits.unread_bytes)).await;
         };
-        self.reader
-            .supervisor
-            .spawn("rest of a body", TaskPolicy::MayEnd, reading);
+        self.reader.supervisor.spawn("rest of a body", TaskPolicy::MayEnd, reading);
     }
 }
 

@@ -6,8 +6,8 @@
 //! {"end":{"counts":{"documents":3,…},"sha256":"…"}}            over all bytes before this line
 //! ```
 //!
-//! Secrets in it are encrypted as in the store. A restore reads the file twice: it is checked to its end before the first
-//! line is stored.
+//! Secrets in it are encrypted as in the store. A restore reads the file twice: it is checked to
+//! its end before the first line is stored.
 
 use std::io::{BufRead, Seek, SeekFrom, Write};
 
@@ -21,7 +21,8 @@ use super::upkeep::{BackupHead, BackupRow, Counts, Piece, Restored, Upkeep};
 
 /// Pieces between the store and the file.
 const QUEUE: usize = 256;
-/// Longest line: an answer to repeat may be as large as what `apply` takes, and is escaped once more here.
+/// Longest line: an answer to repeat may be as large as what `apply` takes, and is escaped once
+/// more here.
 const MAX_LINE_BYTES: u64 = 64 * 1024 * 1024;
 
 /// Why a backup was not written or restored.
@@ -63,7 +64,8 @@ struct End {
     sha256: String,
 }
 
-/// Writes what a store exports. `export` is [`Upkeep::export`] or [`super::export`] with the sender that it is given.
+/// Writes what a store exports. `export` is [`Upkeep::export`] or [`super::export`] with the sender
+/// that it is given.
 ///
 /// # Errors
 /// [`BackupError`]; what was written until then is no backup, as it has no last line.
@@ -73,7 +75,8 @@ where
     F: Future<Output = Result<(), StoreError>>,
 {
     let (sender, receiver) = mpsc::channel(QUEUE);
-    // A failed write drops the receiver, which ends the export; then the file's error is the one that counts.
+    // A failed write drops the receiver, which ends the export; then the file's error is the one
+    // that counts.
     let (exported, written) = tokio::join!(export(sender), write_pieces(receiver, out));
     let written = written?;
     exported?;
@@ -114,11 +117,7 @@ struct Lines<'a> {
 
 impl<'a> Lines<'a> {
     fn new(out: &'a mut (dyn Write + Send)) -> Self {
-        Self {
-            out,
-            hash: Sha256::new(),
-            counts: Counts::new(),
-        }
+        Self { out, hash: Sha256::new(), counts: Counts::new() }
     }
 
     fn line(&mut self, value: &impl Serialize) -> Result<(), BackupError> {
@@ -131,10 +130,7 @@ impl<'a> Lines<'a> {
 
     fn end(mut self) -> Result<Counts, BackupError> {
         let sha256 = hex(&self.hash.clone().finalize());
-        let end = End {
-            counts: self.counts.clone(),
-            sha256,
-        };
+        let end = End { counts: self.counts.clone(), sha256 };
         self.line(&Trailer { end })?;
         self.out.flush()?;
         Ok(self.counts)
@@ -145,7 +141,10 @@ impl<'a> Lines<'a> {
 ///
 /// # Errors
 /// [`BackupError`]; then the store is as empty as before.
-pub async fn restore<R: BufRead + Seek + Send>(store: &dyn Upkeep, file: &mut R) -> Result<Restored, BackupError> {
+pub async fn restore<R: BufRead + Seek + Send>(
+    store: &dyn Upkeep,
+    file: &mut R,
+) -> Result<Restored, BackupError> {
     check(file)?;
     restore_checked(store, file).await
 }
@@ -165,7 +164,10 @@ pub async fn restore_checked<R: BufRead + Seek + Send>(
     Ok(imported?)
 }
 
-async fn read_pieces<R: BufRead + Send>(file: &mut R, pieces: mpsc::Sender<Piece>) -> Result<(), BackupError> {
+async fn read_pieces<R: BufRead + Send>(
+    file: &mut R,
+    pieces: mpsc::Sender<Piece>,
+) -> Result<(), BackupError> {
     let mut reader = Reader::new(file);
     while let Some(line) = reader.next_line()? {
         let piece = match line {
@@ -206,7 +208,11 @@ pub fn check<R: BufRead>(file: &mut R) -> Result<Summary, BackupError> {
                 }
                 return Ok(Summary { head, counts });
             }
-            None => return Err(reader.fault("the last line is missing: the backup was not written to its end")),
+            None => {
+                return Err(
+                    reader.fault("the last line is missing: the backup was not written to its end")
+                );
+            }
         }
     }
 }
@@ -227,18 +233,14 @@ struct Reader<'a, R> {
 
 impl<'a, R: BufRead> Reader<'a, R> {
     fn new(file: &'a mut R) -> Self {
-        Self {
-            file,
-            hash: Sha256::new(),
-            line: 0,
-            ended: false,
-        }
+        Self { file, hash: Sha256::new(), line: 0, ended: false }
     }
 
     fn next_line(&mut self) -> Result<Option<Line>, BackupError> {
         self.line += 1;
         let mut bytes = Vec::new();
-        let read = std::io::Read::take(&mut *self.file, MAX_LINE_BYTES).read_until(b'\n', &mut bytes)?;
+        let read =
+            std::io::Read::take(&mut *self.file, MAX_LINE_BYTES).read_until(b'\n', &mut bytes)?;
         if read == 0 {
             return Ok(None);
         }
@@ -268,10 +270,7 @@ impl<'a, R: BufRead> Reader<'a, R> {
     }
 
     fn fault(&self, detail: impl Into<String>) -> BackupError {
-        BackupError::Line {
-            line: self.line,
-            detail: detail.into(),
-        }
+        BackupError::Line { line: self.line, detail: detail.into() }
     }
 }
 

@@ -13,10 +13,7 @@ async fn store() -> SqliteStore {
 
 async fn filled() -> SqliteStore {
     let store = store().await;
-    store
-        .commit(&[record(commit(1, &["a", "b"])), record(commit(2, &["a"]))])
-        .await
-        .unwrap();
+    store.commit(&[record(commit(1, &["a", "b"])), record(commit(2, &["a"]))]).await.unwrap();
     store.append_audit(&[audit("x", None)]).await.unwrap();
     store.add_token(&token("t"), &audit("y", None)).await.unwrap();
     store
@@ -44,9 +41,7 @@ async fn what_was_backed_up_is_restored() {
         documents
     };
     assert_eq!(sorted(after.documents), sorted(before.documents));
-    new.commit(&[record(commit(restored.revision + 1, &["c"]))])
-        .await
-        .unwrap();
+    new.commit(&[record(commit(restored.revision + 1, &["c"]))]).await.unwrap();
 }
 
 #[tokio::test]

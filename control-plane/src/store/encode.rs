@@ -7,7 +7,8 @@
 //! rows ──decode──▶ Commit, Version, Document, AuditEntry, …
 //! ```
 //!
-//! What users write is inside of JSON texts: no key of theirs becomes a column, nor a member that the database looks at.
+//! What users write is inside of JSON texts: no key of theirs becomes a column, nor a member that
+//! the database looks at.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -19,7 +20,10 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::rows::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenRow, VersionRow};
-use super::{AuditEntry, Change, Commit, CommitRecord, IdempotencyRecord, Op, StoreError, TokenRecord, Version};
+use super::{
+    AuditEntry, Change, Commit, CommitRecord, IdempotencyRecord, Op, StoreError, TokenRecord,
+    Version,
+};
 
 /// A commit record as rows.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -76,15 +80,11 @@ fn encode_commit(record: &CommitRecord) -> Result<EncodedCommit, StoreError> {
     };
     let audit = record.audit.iter().map(AuditRow::encode).collect::<Result<_, _>>()?;
     let idempotency = record.idempotency.as_ref().map(IdempotencyRow::encode);
-    Ok(EncodedCommit {
-        event,
-        versions,
-        audit,
-        idempotency,
-    })
+    Ok(EncodedCommit { event, versions, audit, idempotency })
 }
 
-/// What each document is after all of these changes, which ascend: its last version, which may be its deletion.
+/// What each document is after all of these changes, which ascend: its last version, which may be
+/// its deletion.
 pub(crate) fn last_versions<'a>(
     versions: impl IntoIterator<Item = &'a VersionRow>,
 ) -> BTreeMap<&'a str, &'a VersionRow> {
@@ -92,8 +92,8 @@ pub(crate) fn last_versions<'a>(
     versions.map(|version| (version.key.as_str(), version)).collect()
 }
 
-/// Commits from their events and the changes of all of them, both ascending. They must follow `after` without a hole,
-/// and each must have all its changes.
+/// Commits from their events and the changes of all of them, both ascending. They must follow
+/// `after` without a hole, and each must have all its changes.
 pub(crate) fn decode_commits(
     after: u64,
     events: Vec<EventRow>,
@@ -141,18 +141,12 @@ impl VersionRow {
     /// The document as it is from this change on.
     #[cfg(feature = "mongodb")]
     pub(crate) fn into_current(self) -> DocumentRow {
-        DocumentRow {
-            key: self.key,
-            revision: self.revision,
-            document: self.document,
-        }
+        DocumentRow { key: self.key, revision: self.revision, document: self.document }
     }
 
     pub(crate) fn into_version(self) -> Result<Version, StoreError> {
-        let key: Key = self
-            .key
-            .parse()
-            .map_err(|error| corrupt(format_args!("a version: {error}")))?;
+        let key: Key =
+            self.key.parse().map_err(|error| corrupt(format_args!("a version: {error}")))?;
         Ok(Version {
             revision: unsigned(self.revision)?,
             time: Timestamp::from_millis(self.time),
@@ -170,10 +164,8 @@ impl VersionRow {
 
 impl DocumentRow {
     pub(crate) fn into_document(self) -> Result<Document, StoreError> {
-        let key: Key = self
-            .key
-            .parse()
-            .map_err(|error| corrupt(format_args!("a document: {error}")))?;
+        let key: Key =
+            self.key.parse().map_err(|error| corrupt(format_args!("a document: {error}")))?;
         document(key, &self.document)
     }
 }
@@ -228,8 +220,7 @@ fn audit_key(kind: &str, service: Option<&str>, name: &str) -> Result<Key, Store
         Some(service) => format!("{kind}/{service}/{name}"),
         None => format!("{kind}/{name}"),
     };
-    text.parse()
-        .map_err(|error| corrupt(format_args!("an audit entry: {error}")))
+    text.parse().map_err(|error| corrupt(format_args!("an audit entry: {error}")))
 }
 
 impl IdempotencyRow {
@@ -312,7 +303,8 @@ pub(crate) fn document_text(document: &Document) -> Result<String, StoreError> {
 
 /// The document that [`document_text`] wrote.
 pub(crate) fn document(key: Key, text: &str) -> Result<Document, StoreError> {
-    let read: Stored<'_> = serde_json::from_str(text).map_err(|error| corrupt(format_args!("{key}: {error}")))?;
+    let read: Stored<'_> =
+        serde_json::from_str(text).map_err(|error| corrupt(format_args!("{key}: {error}")))?;
     Ok(Document {
         key,
         uid: read.uid.into_owned(),
@@ -334,7 +326,8 @@ fn op(word: &str) -> Result<Op, StoreError> {
 }
 
 fn json<T: Serialize + ?Sized>(value: &T) -> Result<String, StoreError> {
-    serde_json::to_string(value).map_err(|error| corrupt(format_args!("it cannot be written as JSON: {error}")))
+    serde_json::to_string(value)
+        .map_err(|error| corrupt(format_args!("it cannot be written as JSON: {error}")))
 }
 
 fn parsed(what: &str, text: &str) -> Result<Vec<String>, StoreError> {

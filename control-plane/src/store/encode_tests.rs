@@ -32,7 +32,8 @@ fn value() -> impl Strategy<Value = Value> {
 
 proptest! {
     #[test]
-    fn a_document_is_read_as_it_was_written(spec in value(), labels in prop::collection::btree_map("[a-z./]{1,20}", ".{0,10}", 0..4)) {
+    fn a_document_is_read_as_it_was_written(spec in value(),
+        labels in prop::collection::btree_map("[a-z./]{1,20}", ".{0,10}", 0..4)) {
         let mut written = node("robot-1", 7);
         written.spec = Arc::new(spec);
         written.labels = labels;
@@ -90,16 +91,9 @@ fn commits_that_do_not_follow_one_another_are_refused() {
 fn garbage_is_corrupt_and_no_panic() {
     let key: Key = "Node/a".parse().unwrap();
     for text in ["", "{}", "null", "{\"uid\":1}", "[1", "\u{0}"] {
-        assert!(
-            matches!(document(key.clone(), text), Err(StoreError::Corrupt(_))),
-            "{text}"
-        );
+        assert!(matches!(document(key.clone(), text), Err(StoreError::Corrupt(_))), "{text}");
     }
-    let row = DocumentRow {
-        key: "nonsense".to_owned(),
-        revision: 1,
-        document: "{}".to_owned(),
-    };
+    let row = DocumentRow { key: "nonsense".to_owned(), revision: 1, document: "{}".to_owned() };
     assert!(matches!(row.into_document(), Err(StoreError::Corrupt(_))));
     assert!(unsigned(-1).is_err());
 }

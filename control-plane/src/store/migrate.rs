@@ -6,9 +6,10 @@
 //! open: refuse what is too new or was changed ─▶ do the next step ─▶ record it ─▶ …
 //! ```
 //!
-//! A migration is never changed once it was released: its checksum is in every store that it was applied to. A schema
-//! changes by expanding first (new things beside the old, `min_version` stays, so that programs of the version before
-//! run on) and contracting in a later release (`min_version` rises, and older programs refuse to start).
+//! A migration is never changed once it was released: its checksum is in every store that it was
+//! applied to. A schema changes by expanding first (new things beside the old, `min_version` stays,
+//! so that programs of the version before run on) and contracting in a later release (`min_version`
+//! rises, and older programs refuse to start).
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -51,8 +52,8 @@ pub enum Action {
     Sql(Cow<'static, str>),
     /// A database command as JSON (MongoDB): one that does nothing when it is done again.
     Command(Cow<'static, str>),
-    /// Each document and each version of one is replaced by what the function makes of it; `None` leaves it. The
-    /// function leaves what it has made.
+    /// Each document and each version of one is replaced by what the function makes of it; `None`
+    /// leaves it. The function leaves what it has made.
     Rewrite {
         /// Stands for the function in the checksum.
         text: Cow<'static, str>,
@@ -69,7 +70,8 @@ pub(crate) enum StoreKind {
     MongoDb,
 }
 
-/// Called after each step was recorded, with `number name/step`. For tests that end the process there.
+/// Called after each step was recorded, with `number name/step`. For tests that end the process
+/// there.
 pub type AfterStep = Arc<dyn Fn(&str) + Send + Sync>;
 
 /// The migrations that a program knows.
@@ -82,10 +84,7 @@ pub struct Migrations {
 impl Default for Migrations {
     /// Those of this program.
     fn default() -> Self {
-        Self {
-            all: vec![first()],
-            after_step: None,
-        }
+        Self { all: vec![first()], after_step: None }
     }
 }
 
@@ -150,17 +149,15 @@ pub(crate) trait Target: Send + Sync {
 /// What is to be done on a store.
 ///
 /// # Errors
-/// [`StoreError::Refused`] if the store is too new for this program, or a migration was changed after it was applied.
+/// [`StoreError::Refused`] if the store is too new for this program, or a migration was changed
+/// after it was applied.
 pub(crate) async fn plan(target: &dyn Target, migrations: &Migrations) -> Result<Plan, StoreError> {
     let (done, min_version) = target.state().await?;
     let pending = pending(target.kind(), migrations, &done, min_version)?;
-    let complete = |migration: &&Migration| !pending.iter().any(|step| step.done.number == migration.number);
-    let version = migrations
-        .all
-        .iter()
-        .take_while(complete)
-        .map(|migration| migration.number)
-        .max();
+    let complete =
+        |migration: &&Migration| !pending.iter().any(|step| step.done.number == migration.number);
+    let version =
+        migrations.all.iter().take_while(complete).map(|migration| migration.number).max();
     Ok(Plan {
         version: version.unwrap_or(0),
         target: migrations.version(),
@@ -171,8 +168,12 @@ pub(crate) async fn plan(target: &dyn Target, migrations: &Migrations) -> Result
 /// Does what is to be done. Returns the labels of the steps.
 ///
 /// # Errors
-/// As [`plan`], and when a step fails: what was done before stays, and the next call goes on from there.
-pub(crate) async fn apply(target: &dyn Target, migrations: &Migrations) -> Result<Vec<String>, StoreError> {
+/// As [`plan`], and when a step fails: what was done before stays, and the next call goes on from
+/// there.
+pub(crate) async fn apply(
+    target: &dyn Target,
+    migrations: &Migrations,
+) -> Result<Vec<String>, StoreError> {
     let (done, min_version) = target.state().await?;
     let mut labels = Vec::new();
     for step in pending(target.kind(), migrations, &done, min_version)? {
@@ -213,11 +214,13 @@ fn pending(
     let version = migrations.version();
     if min_version > version {
         return Err(StoreError::Refused(format!(
-            "the store needs a program that knows schema {min_version}, and this one knows {version}: start a newer \
+            "the store needs a program that knows schema {min_version}, and this one knows \
+             {version}: start a newer \
              blaze-config, or restore a backup that was made before the upgrade"
         )));
     }
-    let known: BTreeMap<(u32, u32), &Done> = done.iter().map(|done| ((done.number, done.step), done)).collect();
+    let known: BTreeMap<(u32, u32), &Done> =
+        done.iter().map(|done| ((done.number, done.step), done)).collect();
     let mut pending = Vec::new();
     for migration in &migrations.all {
         let checksum = checksum(kind, migration);
@@ -238,7 +241,8 @@ fn pending(
                 Some(done) if done.checksum == checksum => {}
                 Some(_) => {
                     return Err(StoreError::Refused(format!(
-                        "migration {:04} {} was changed after it was applied to this store: run the released program, \
+                        "migration {:04} {} was changed after it was applied to this store: run \
+                         the released program, \
                          or restore a backup into an empty store",
                         migration.number, migration.name
                     )));
@@ -280,38 +284,17 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 fn first() -> Migration {
     const SQL: &str = include_str!("../../../migrations/0001_first.sql");
     let commands: [(&'static str, &'static str); 11] = [
-        (
-            "events",
-            include_str!("../../../migrations/0001_first.mongodb/01_events.json"),
-        ),
-        (
-            "versions",
-            include_str!("../../../migrations/0001_first.mongodb/02_versions.json"),
-        ),
-        (
-            "documents",
-            include_str!("../../../migrations/0001_first.mongodb/03_documents.json"),
-        ),
-        (
-            "audit",
-            include_str!("../../../migrations/0001_first.mongodb/04_audit.json"),
-        ),
-        (
-            "idempotency",
-            include_str!("../../../migrations/0001_first.mongodb/05_idempotency.json"),
-        ),
-        (
-            "tokens",
-            include_str!("../../../migrations/0001_first.mongodb/06_tokens.json"),
-        ),
+        ("events", include_str!("../../../migrations/0001_first.mongodb/01_events.json")),
+        ("versions", include_str!("../../../migrations/0001_first.mongodb/02_versions.json")),
+        ("documents", include_str!("../../../migrations/0001_first.mongodb/03_documents.json")),
+        ("audit", include_str!("../../../migrations/0001_first.mongodb/04_audit.json")),
+        ("idempotency", include_str!("../../../migrations/0001_first.mongodb/05_idempotency.json")),
+        ("tokens", include_str!("../../../migrations/0001_first.mongodb/06_tokens.json")),
         (
             "versions-index",
             include_str!("../../../migrations/0001_first.mongodb/07_versions_index.json"),
         ),
-        (
-            "audit-index",
-            include_str!("../../../migrations/0001_first.mongodb/08_audit_index.json"),
-        ),
+        ("audit-index", include_str!("../../../migrations/0001_first.mongodb/08_audit_index.json")),
         (
             "idempotency-index",
             include_str!("../../../migrations/0001_first.mongodb/09_idempotency_index.json"),

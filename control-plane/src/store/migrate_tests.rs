@@ -72,28 +72,24 @@ async fn steps_are_done_once_and_in_order() {
 #[tokio::test]
 async fn after_a_failure_it_goes_on_from_there() {
     let migrations = only(vec![migration(1, 1, &["a", "b", "c"])]);
-    let mut store = Remembers {
-        fails_at: Some(1),
-        ..Remembers::default()
-    };
+    let mut store = Remembers { fails_at: Some(1), ..Remembers::default() };
     apply(&store, &migrations).await.unwrap_err();
     assert_eq!(plan(&store, &migrations).await.unwrap().version, 0);
     store.fails_at = None;
-    assert_eq!(
-        apply(&store, &migrations).await.unwrap(),
-        ["0001 test/step1", "0001 test/step2"]
-    );
+    assert_eq!(apply(&store, &migrations).await.unwrap(), ["0001 test/step1", "0001 test/step2"]);
 }
 
 #[tokio::test]
 async fn a_changed_migration_and_a_store_that_is_too_new_are_refused() {
     let store = Remembers::default();
-    apply(&store, &only(vec![migration(1, 1, &["a"]), migration(2, 2, &["b"])]))
-        .await
-        .unwrap();
-    let changed = apply(&store, &only(vec![migration(1, 1, &["A"]), migration(2, 2, &["b"])])).await;
+    apply(&store, &only(vec![migration(1, 1, &["a"]), migration(2, 2, &["b"])])).await.unwrap();
+    let changed =
+        apply(&store, &only(vec![migration(1, 1, &["A"]), migration(2, 2, &["b"])])).await;
     assert!(
-        matches!(&changed, Err(StoreError::Refused(text)) if text.contains("0001 test was changed")),
+        matches!(
+            &changed,
+            Err(StoreError::Refused(text)) if text.contains("0001 test was changed"),
+        ),
         "{changed:?}"
     );
     let old = apply(&store, &only(vec![migration(1, 1, &["a"])])).await;
@@ -106,9 +102,7 @@ async fn a_changed_migration_and_a_store_that_is_too_new_are_refused() {
 #[tokio::test]
 async fn an_older_program_may_use_a_store_that_was_only_expanded() {
     let store = Remembers::default();
-    apply(&store, &only(vec![migration(1, 1, &["a"]), migration(2, 1, &["b"])]))
-        .await
-        .unwrap();
+    apply(&store, &only(vec![migration(1, 1, &["a"]), migration(2, 1, &["b"])])).await.unwrap();
     let old = only(vec![migration(1, 1, &["a"])]);
     assert_eq!(apply(&store, &old).await.unwrap(), Vec::<String>::new());
 }

@@ -6,8 +6,9 @@
 //! both: rows and encode (how it is stored), retain (what history keeps), migrate (schemas), backup (files), conformance (the rules for both)
 //! ```
 //!
-//! One commit is one revision, and revisions have no holes. A commit with its history, audit and answer to repeat is in
-//! the store or nothing of it is. Nobody gives revisions out: who inserts revision n + 1 first has it.
+//! One commit is one revision, and revisions have no holes. A commit with its history, audit and
+//! answer to repeat is in the store or nothing of it is. Nobody gives revisions out: who inserts
+//! revision n + 1 first has it.
 
 pub mod backup;
 pub(crate) mod encode;
@@ -42,15 +43,19 @@ use upkeep::Piece;
 pub(crate) const READ_BYTES: i64 = 8 * 1024 * 1024;
 /// How long the audit is kept: 400 days, in milliseconds.
 pub(crate) const AUDIT_KEPT_MS: i64 = 400 * 24 * 3_600 * 1_000;
-/// How long a token is remembered after it has run out: clocks differ, and a revoked one must be known as long as it is
-/// accepted (`blaze_auth::LEEWAY_S`, twice). MongoDB's index says the same.
+/// How long a token is remembered after it has run out: clocks differ, and a revoked one must be
+/// known as long as it is accepted (`blaze_auth::LEEWAY_S`, twice). MongoDB's index says the same.
 pub(crate) const TOKEN_KEPT_MS: i64 = 60_000;
 
 /// Opens the store that the node file names, and migrates it.
 ///
 /// # Errors
-/// [`StoreError::Refused`] says what to do; [`StoreError::Unavailable`] if it cannot be reached now.
-pub async fn open(section: &StoreSection, supervisor: &Supervisor) -> Result<Arc<dyn FullStore>, StoreError> {
+/// [`StoreError::Refused`] says what to do; [`StoreError::Unavailable`] if it cannot be reached
+/// now.
+pub async fn open(
+    section: &StoreSection,
+    supervisor: &Supervisor,
+) -> Result<Arc<dyn FullStore>, StoreError> {
     open_with(section, &Migrations::default(), supervisor).await
 }
 
@@ -64,11 +69,13 @@ pub async fn open_with(
     supervisor: &Supervisor,
 ) -> Result<Arc<dyn FullStore>, StoreError> {
     match section {
-        StoreSection::Sqlite { path } => Ok(Arc::new(SqliteStore::open_with(path, migrations, supervisor).await?)),
+        StoreSection::Sqlite { path } => {
+            Ok(Arc::new(SqliteStore::open_with(path, migrations, supervisor).await?))
+        }
         #[cfg(feature = "mongodb")]
-        StoreSection::MongoDb { uri, database } => Ok(Arc::new(
-            MongoStore::open_with(uri.reveal(), database, migrations).await?,
-        )),
+        StoreSection::MongoDb { uri, database } => {
+            Ok(Arc::new(MongoStore::open_with(uri.reveal(), database, migrations).await?))
+        }
         #[cfg(not(feature = "mongodb"))]
         StoreSection::MongoDb { .. } => Err(without_mongodb()),
     }
@@ -91,7 +98,9 @@ pub async fn plan(section: &StoreSection) -> Result<Plan, StoreError> {
     match section {
         StoreSection::Sqlite { path } => SqliteStore::plan(path, &migrations).await,
         #[cfg(feature = "mongodb")]
-        StoreSection::MongoDb { uri, database } => MongoStore::plan(uri.reveal(), database, &migrations).await,
+        StoreSection::MongoDb { uri, database } => {
+            MongoStore::plan(uri.reveal(), database, &migrations).await
+        }
         #[cfg(not(feature = "mongodb"))]
         StoreSection::MongoDb { .. } => Err(without_mongodb()),
     }
@@ -109,7 +118,9 @@ pub async fn export(
     match section {
         StoreSection::Sqlite { path } => SqliteStore::export_beside(path, supervisor, pieces).await,
         #[cfg(feature = "mongodb")]
-        StoreSection::MongoDb { uri, database } => MongoStore::export_beside(uri.reveal(), database, pieces).await,
+        StoreSection::MongoDb { uri, database } => {
+            MongoStore::export_beside(uri.reveal(), database, pieces).await
+        }
         #[cfg(not(feature = "mongodb"))]
         StoreSection::MongoDb { .. } => Err(without_mongodb()),
     }
@@ -117,5 +128,7 @@ pub async fn export(
 
 #[cfg(not(feature = "mongodb"))]
 fn without_mongodb() -> StoreError {
-    StoreError::Refused("this program was built without MongoDB: build it with the feature `mongodb`".to_owned())
+    StoreError::Refused(
+        "this program was built without MongoDB: build it with the feature `mongodb`".to_owned(),
+    )
 }

@@ -153,7 +153,8 @@ pub struct Snapshot {
 pub struct CommitBatch {
     /// Ascending and contiguous; may be fewer than there are.
     pub commits: Vec<Commit>,
-    /// The floor, read *after* the commits: if it is above the revision that was asked for, the commits have a gap.
+    /// The floor, read *after* the commits: if it is above the revision that was asked for, the
+    /// commits have a gap.
     pub floor: u64,
 }
 
@@ -234,7 +235,9 @@ impl StoreError {
     pub fn told(&self) -> &'static str {
         match self {
             Self::Unavailable(_) => "the store cannot be reached",
-            Self::Corrupt(_) | Self::Refused(_) => "the store cannot be used; see the log of the service",
+            Self::Corrupt(_) | Self::Refused(_) => {
+                "the store cannot be used; see the log of the service"
+            }
         }
     }
 
@@ -265,8 +268,9 @@ pub trait CommitLog: Send + Sync + 'static {
     /// Whether other processes may write to it too. `false`: nobody does while this one lives.
     fn is_shared(&self) -> bool;
 
-    /// A revision such that whoever has read it, and wrote all newer ones, has the newest state *now*: no other process
-    /// can have written since, or read what this one has not. `None`: ask for the [`CommitLog::head`].
+    /// A revision such that whoever has read it, and wrote all newer ones, has the newest state
+    /// *now*: no other process can have written since, or read what this one has not. `None`: ask
+    /// for the [`CommitLog::head`].
     fn alone(&self) -> Option<u64> {
         (!self.is_shared()).then_some(0)
     }
@@ -277,28 +281,29 @@ pub trait CommitLog: Send + Sync + 'static {
     /// [`StoreError`].
     async fn load(&self) -> Result<Snapshot, StoreError>;
 
-    /// The newest revision that no crash can take back. At least that of every commit that was acknowledged anywhere
-    /// before the call.
+    /// The newest revision that no crash can take back. At least that of every commit that was
+    /// acknowledged anywhere before the call.
     ///
     /// # Errors
     /// [`StoreError`].
     async fn head(&self) -> Result<u64, StoreError>;
 
-    /// Commits after a revision, at most `limit` and about 8 MiB of them (at least one if there is one).
+    /// Commits after a revision, at most `limit` and about 8 MiB of them (at least one if there is
+    /// one).
     ///
     /// # Errors
     /// [`StoreError`].
     async fn commits_after(&self, revision: u64, limit: usize) -> Result<CommitBatch, StoreError>;
 
-    /// Writes commits with contiguous revisions, all or none of them, durable before it returns. An unknown result is
-    /// settled here, by the batch id, as long as the store can be read.
+    /// Writes commits with contiguous revisions, all or none of them, durable before it returns. An
+    /// unknown result is settled here, by the batch id, as long as the store can be read.
     ///
     /// # Errors
     /// [`CommitError`].
     async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError>;
 
-    /// Returns when another process may have committed; at the latest after 100 ms where the store cannot tell, and now and
-    /// then all the same. Never returns where nobody else can write.
+    /// Returns when another process may have committed; at the latest after 100 ms where the store
+    /// cannot tell, and now and then all the same. Never returns where nobody else can write.
     async fn foreign_commit(&self);
 }
 
@@ -309,23 +314,34 @@ pub trait Archive: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`StoreError`].
-    async fn versions(&self, key: &Key, below: Option<u64>, limit: usize) -> Result<Vec<Version>, StoreError>;
+    async fn versions(
+        &self,
+        key: &Key,
+        below: Option<u64>,
+        limit: usize,
+    ) -> Result<Vec<Version>, StoreError>;
 
-    /// For every document that changed after `revision` and up to `until`: what it was at `revision`. Exact for revisions from
-    /// the floor on.
+    /// For every document that changed after `revision` and up to `until`: what it was at
+    /// `revision`. Exact for revisions from the floor on.
     ///
     /// # Errors
     /// [`StoreError`].
-    async fn documents_at(&self, revision: u64, until: u64) -> Result<Vec<(Key, Option<Document>)>, StoreError>;
+    async fn documents_at(
+        &self,
+        revision: u64,
+        until: u64,
+    ) -> Result<Vec<(Key, Option<Document>)>, StoreError>;
 
-    /// Raises the floor to `floor` (never lowers it), then removes commits up to it, and versions that neither hold at
-    /// the floor or above, nor are among the newest `keep_versions` of their document. Gives the floor that now is.
+    /// Raises the floor to `floor` (never lowers it), then removes commits up to it, and versions
+    /// that neither hold at the floor or above, nor are among the newest `keep_versions` of their
+    /// document. Gives the floor that now is.
     ///
     /// # Errors
     /// [`StoreError`].
     async fn trim(&self, floor: u64, keep_versions: u32) -> Result<u64, StoreError>;
 
-    /// Does what can wait, in small parts. To be called about once a second; nothing but time is lost without.
+    /// Does what can wait, in small parts. To be called about once a second; nothing but time is
+    /// lost without.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -355,7 +371,11 @@ pub trait Archive: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`StoreError`].
-    async fn idempotency(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError>;
+    async fn idempotency(
+        &self,
+        id: &str,
+        now: Timestamp,
+    ) -> Result<Option<IdempotencyRecord>, StoreError>;
 }
 
 /// Tokens that the service gave out.
@@ -367,12 +387,18 @@ pub trait TokenStore: Send + Sync + 'static {
     /// [`StoreError`].
     async fn add_token(&self, token: &TokenRecord, audit: &AuditEntry) -> Result<(), StoreError>;
 
-    /// Revokes one, with its audit entry in the same transaction; `false` if there is none of that id. Revoking twice
-    /// keeps the first time. An id that was not given out here can be revoked as well if `expire_time` is given.
+    /// Revokes one, with its audit entry in the same transaction; `false` if there is none of that
+    /// id. Revoking twice keeps the first time. An id that was not given out here can be revoked as
+    /// well if `expire_time` is given.
     ///
     /// # Errors
     /// [`StoreError`].
-    async fn revoke_token(&self, id: &str, time: Timestamp, audit: &AuditEntry) -> Result<bool, StoreError>;
+    async fn revoke_token(
+        &self,
+        id: &str,
+        time: Timestamp,
+        audit: &AuditEntry,
+    ) -> Result<bool, StoreError>;
 
     /// All that have not expired at `now`, newest first.
     ///

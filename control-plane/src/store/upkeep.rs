@@ -11,7 +11,8 @@ use super::encode::{document, document_text};
 use super::rows::{AuditRow, DocumentRow, IdempotencyRow, TokenRow, VersionRow};
 use super::{Store, StoreError};
 
-/// What `restore` adds to the revision, so that no client takes the restored store for the one it knew.
+/// What `restore` adds to the revision, so that no client takes the restored store for the one it
+/// knew.
 pub const RESTORE_RAISES_BY: u64 = 1_000_000;
 
 /// The first line of a backup: what it is of.
@@ -86,8 +87,8 @@ pub type Rewriter<'a> = &'a (dyn Fn(&Document) -> Option<Document> + Sync);
 /// A store as its operator knows it.
 #[async_trait]
 pub trait Upkeep: Send + Sync + 'static {
-    /// Sends everything that is true at one revision: documents, versions, audit, tokens, answers to repeat. Writing goes
-    /// on meanwhile.
+    /// Sends everything that is true at one revision: documents, versions, audit, tokens, answers
+    /// to repeat. Writing goes on meanwhile.
     ///
     /// # Errors
     /// [`StoreError`]; also when nobody takes the pieces any more.
@@ -96,17 +97,20 @@ pub trait Upkeep: Send + Sync + 'static {
     /// Fills an empty store. Nothing of it can be seen before [`Piece::End`] was there.
     ///
     /// # Errors
-    /// [`StoreError::Refused`] if the store is not empty or the pieces are not whole; [`StoreError`].
+    /// [`StoreError::Refused`] if the store is not empty or the pieces are not whole;
+    /// [`StoreError`].
     async fn import(&self, pieces: mpsc::Receiver<Piece>) -> Result<Restored, StoreError>;
 
-    /// Replaces the form of current documents and of all versions, without a commit: what they mean must stay the same.
-    /// Works in small steps and may be done again after a failure. Gives how many were replaced.
+    /// Replaces the form of current documents and of all versions, without a commit: what they mean
+    /// must stay the same. Works in small steps and may be done again after a failure. Gives how
+    /// many were replaced.
     ///
     /// # Errors
     /// [`StoreError`].
     async fn rewrite(&self, make: Rewriter<'_>) -> Result<u64, StoreError>;
 
-    /// Lets go of files, threads and connections. Whatever comes later is [`StoreError::Unavailable`].
+    /// Lets go of files, threads and connections. Whatever comes later is
+    /// [`StoreError::Unavailable`].
     async fn close(&self);
 }
 
@@ -115,10 +119,13 @@ pub trait FullStore: Store + Upkeep {}
 impl<T: Store + Upkeep> FullStore for T {}
 
 /// The new text of a stored document, if it gets one.
-pub(crate) fn rewritten(key: &str, text: &str, make: Rewriter<'_>) -> Result<Option<String>, StoreError> {
-    let key = key
-        .parse()
-        .map_err(|error| super::encode::corrupt(format_args!("{key:?}: {error}")))?;
+pub(crate) fn rewritten(
+    key: &str,
+    text: &str,
+    make: Rewriter<'_>,
+) -> Result<Option<String>, StoreError> {
+    let key =
+        key.parse().map_err(|error| super::encode::corrupt(format_args!("{key:?}: {error}")))?;
     match make(&document(key, text)?) {
         None => Ok(None),
         Some(new) => Ok(Some(document_text(&new)?).filter(|new| new != text)),
@@ -151,5 +158,7 @@ pub(crate) fn not_whole() -> StoreError {
 
 /// Why an import does not begin.
 pub(crate) fn not_empty() -> StoreError {
-    StoreError::Refused("a backup is restored into an empty store only: name a new file or database".to_owned())
+    StoreError::Refused(
+        "a backup is restored into an empty store only: name a new file or database".to_owned(),
+    )
 }

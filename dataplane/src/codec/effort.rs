@@ -8,11 +8,13 @@
 //!      12, 11, 10, 9 … 3, 1, as it is                         (later and later, if it did not last)
 //! ```
 //!
-//! What a frame takes is measured at the level in use, and every ten seconds with one frame at the next higher one. For
-//! the others it is what they took, compared with these, when they were last in use, or else what they take as a rule.
-//! So a processor that becomes slow, or a picture that becomes difficult, changes all of them.
+//! What a frame takes is measured at the level in use, and every ten seconds with one frame at the
+//! next higher one. For the others it is what they took, compared with these, when they were last
+//! in use, or else what they take as a rule. So a processor that becomes slow, or a picture that
+//! becomes difficult, changes all of them.
 //!
-//! A stream that does not become smaller goes as it is, and one frame in ten seconds is tried. Pure: time is given.
+//! A stream that does not become smaller goes as it is, and one frame in ten seconds is tried.
+//! Pure: time is given.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -22,8 +24,8 @@ use super::lz4::HIGHEST_LEVEL;
 #[cfg(test)]
 mod tests;
 
-/// Levels, and what a frame takes at each of them as a rule compared with the first one; measured on camera frames.
-/// Level 2 is missing because it is level 1.
+/// Levels, and what a frame takes at each of them as a rule compared with the first one; measured
+/// on camera frames. Level 2 is missing because it is level 1.
 const STEPS: [(u8, f64); STEP_COUNT] = [
     (1, 1.0),
     (3, 7.0),
@@ -42,8 +44,8 @@ const STEP_COUNT: usize = 11;
 const TOO_MUCH: f64 = 0.85;
 /// … after so long.
 const LOWER_AFTER: Duration = Duration::from_secs(1);
-/// A lower level is one with this work at most. Between it and [`RAISE_BELOW`] nothing changes, so that an error of
-/// estimation does not make it go to and fro.
+/// A lower level is one with this work at most. Between it and [`RAISE_BELOW`] nothing changes, so
+/// that an error of estimation does not make it go to and fro.
 const LOWER_TO: f64 = 0.75;
 /// A step higher is taken if it makes less work than this …
 const RAISE_BELOW: f64 = 0.6;
@@ -55,10 +57,11 @@ const LASTS: Duration = Duration::from_secs(60);
 const RETRY_AFTER: Duration = Duration::from_secs(60);
 /// … so often: 16 minutes.
 const MAX_DOUBLINGS: u32 = 4;
-/// Frames at a new level that say what it takes compared with the others; later ones say how fast all of them are.
+/// Frames at a new level that say what it takes compared with the others; later ones say how fast
+/// all of them are.
 const LEARNING: u32 = 10;
-/// A level takes this many times what it takes as a rule at most, and not less than its inverse: else not the level is
-/// another, but the processor.
+/// A level takes this many times what it takes as a rule at most, and not less than its inverse:
+/// else not the level is another, but the processor.
 const UNUSUAL: f64 = 4.0;
 /// Frames whose median is believed: of a few the thread may have been without a processor.
 const RECENT: usize = 9;
@@ -107,8 +110,8 @@ pub struct Effort {
 }
 
 impl Effort {
-    /// Begins at the configured level, 1 to 12; others count as the nearest one. The topic may use one thread until
-    /// [`Effort::set_threads`] says otherwise.
+    /// Begins at the configured level, 1 to 12; others count as the nearest one. The topic may use
+    /// one thread until [`Effort::set_threads`] says otherwise.
     #[must_use]
     pub fn new(configured: u8, now: Instant) -> Self {
         let top = STEPS.iter().filter(|(level, _)| *level <= configured.max(1)).count();
@@ -144,7 +147,8 @@ impl Effort {
         (!self.goes_as_it_is()).then(|| self.level_of(self.step))
     }
 
-    /// Whether frames go as they are, because the pool has no time for them or because they do not become smaller.
+    /// Whether frames go as they are, because the pool has no time for them or because they do not
+    /// become smaller.
     #[must_use]
     pub fn goes_as_it_is(&self) -> bool {
         self.step == 0 || self.incompressible
@@ -156,15 +160,16 @@ impl Effort {
         self.changes
     }
 
-    /// Threads that would be busy all the time at the configured level; 0 until that is known, and while the stream does
-    /// not become smaller.
+    /// Threads that would be busy all the time at the configured level; 0 until that is known, and
+    /// while the stream does not become smaller.
     #[must_use]
     pub fn wanted(&self) -> f64 {
         let top = if self.incompressible { 0 } else { self.top };
         self.work(top) * self.threads
     }
 
-    /// The level for the next frame; `None`: it goes as it is. To be called once per frame: a trial is handed out once.
+    /// The level for the next frame; `None`: it goes as it is. To be called once per frame: a trial
+    /// is handed out once.
     pub fn next(&mut self, now: Instant) -> Option<u8> {
         let usual = self.level();
         let is_highest = usual.is_some() && self.step == self.top;
@@ -177,8 +182,8 @@ impl Effort {
         Some(self.level_of(tried))
     }
 
-    /// So many frames per second are admitted, whether or not the pool has got to them. To be called every second or
-    /// more often.
+    /// So many frames per second are admitted, whether or not the pool has got to them. To be
+    /// called every second or more often.
     pub fn demand(&mut self, now: Instant, rate_hz: f64) {
         let rate_hz = sensible(rate_hz);
         if let Some(before) = self.rate_at {
@@ -191,19 +196,24 @@ impl Effort {
         self.weigh(now);
     }
 
-    /// A frame was compressed at a level: seconds that a thread of the pool was taken, bytes of the payload as it was
-    /// and as it goes.
-    pub fn compressed(&mut self, now: Instant, level: u8, seconds: f64, before: usize, after: usize) {
+    /// A frame was compressed at a level: seconds that a thread of the pool was taken, bytes of the
+    /// payload as it was and as it goes.
+    pub fn compressed(
+        &mut self,
+        now: Instant,
+        level: u8,
+        seconds: f64,
+        before: usize,
+        after: usize,
+    ) {
         if before == 0 {
             return;
         }
         self.look_at_size(now, before, after);
         // Where nothing is found LZ4 takes another time, and that is not what it would take.
         if !self.incompressible {
-            let step = STEPS
-                .iter()
-                .filter(|(step, _)| *step <= level.clamp(1, HIGHEST_LEVEL))
-                .count();
+            let step =
+                STEPS.iter().filter(|(step, _)| *step <= level.clamp(1, HIGHEST_LEVEL)).count();
             self.learn(step, sensible(seconds).max(1e-9));
         }
         self.weigh(now);
@@ -234,10 +244,8 @@ impl Effort {
             self.ratios.pop_front();
         }
         self.ratios.push_back((before, after));
-        let sums = self
-            .ratios
-            .iter()
-            .fold((0.0, 0.0), |(all_before, all_after), (before, after)| {
+        let sums =
+            self.ratios.iter().fold((0.0, 0.0), |(all_before, all_after), (before, after)| {
                 (all_before + *before as f64, all_after + *after as f64)
             });
         if self.ratios.len() == RATIO_FRAMES && sums.1 > sums.0 * WORTHWHILE {
@@ -313,7 +321,8 @@ impl Effort {
         }
     }
 
-    /// To the highest step that fits, at once: a second at each of those between would be lost frames.
+    /// To the highest step that fits, at once: a second at each of those between would be lost
+    /// frames.
     fn lower(&mut self, now: Instant) {
         if let Some((_, step)) = self.raised.take() {
             let (at, times) = &mut self.retry[step - 1];
@@ -349,9 +358,9 @@ fn median(values: &VecDeque<f64>) -> f64 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Divides the threads of a pool among its topics, by what each of them wants, see [`Effort::wanted`]: who wants little
-/// gets it, with room enough to stay at its level; what is too much for the pool is divided evenly among those that
-/// want more; what is left over goes to all.
+/// Divides the threads of a pool among its topics, by what each of them wants, see
+/// [`Effort::wanted`]: who wants little gets it, with room enough to stay at its level; what is too
+/// much for the pool is divided evenly among those that want more; what is left over goes to all.
 #[must_use]
 pub fn shares(threads: f64, wanted: &[f64]) -> Vec<f64> {
     let threads = sensible(threads);
@@ -369,8 +378,6 @@ pub fn shares(threads: f64, wanted: &[f64]) -> Vec<f64> {
         shares[at] = needs[at].min(left / (needs.len() - done) as f64);
         left -= shares[at];
     }
-    shares
-        .iter_mut()
-        .for_each(|share| *share += left.max(0.0) / needs.len() as f64);
+    shares.iter_mut().for_each(|share| *share += left.max(0.0) / needs.len() as f64);
     shares
 }

@@ -7,9 +7,10 @@
 //! received, and not seen before ─► order: a place ─► pool: a turn, first ─► lz4 ─► in order ─► bridges to brokers
 //! ```
 //!
-//! Each part is whole by itself: [`lz4`] is the codec, [`order`] keeps messages in order while some of them are with
-//! the pool, and says whose turn it is, [`pool`] are the threads, and [`effort`] picks the level. What connects them is
-//! [`press`](crate::lane::press), without threads, and [`plane`](crate::flow::plane).
+//! Each part is whole by itself: [`lz4`] is the codec, [`order`] keeps messages in order while some
+//! of them are with the pool, and says whose turn it is, [`pool`] are the threads, and [`effort`]
+//! picks the level. What connects them is [`press`](crate::lane::press), without threads, and
+//! [`plane`](crate::flow::plane).
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
@@ -58,8 +59,8 @@ pub struct Compressed {
     pub before: usize,
     /// Time on the processor.
     pub processor: Duration,
-    /// Time that a thread of the pool was taken, waiting for a processor included: what [`effort::Effort`] wants to
-    /// know.
+    /// Time that a thread of the pool was taken, waiting for a processor included: what
+    /// [`effort::Effort`] wants to know.
     pub taken: Duration,
 }
 
@@ -95,8 +96,8 @@ impl Work {
     }
 }
 
-/// What a codec gives; where it panics that is [`Done::Failed`]. Only the codec is to run in here: a panic of anything
-/// else must end the process.
+/// What a codec gives; where it panics that is [`Done::Failed`]. Only the codec is to run in here:
+/// a panic of anything else must end the process.
 pub fn guarded(work: impl FnOnce() -> Done) -> Done {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
         tracing::error!("the codec panicked");

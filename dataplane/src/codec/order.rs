@@ -1,15 +1,17 @@
-//! Results in order: a message that is being compressed is not overtaken by those of its writer that came after it.
+//! Results in order: a message that is being compressed is not overtaken by those of its writer
+//! that came after it.
 //!
 //! ```text
 //! group (a topic) ─┬─ line (a writer) ─► [ ready ] [ begun ] [ waits ] [ ready ] ◄── push
 //!                  └─ line …            pop_ready ◄┘  └ finish  └ begin, or it gives way to a newer one
 //! ```
 //!
-//! Each writer of a topic has a line of places. What is finished waits in its place until all before it have left; other
-//! lines do not notice. Who is begun with next goes in rounds: one place of each group, and within a group one of each
-//! line, so that nobody who has much to do keeps the others waiting. A place that gives way to a newer one of its line
-//! leaves its turn to that. Without clock, threads or locks: whoever owns it holds it behind a lock of his own.
-//! Everything costs O(log n) in the places of one line at most.
+//! Each writer of a topic has a line of places. What is finished waits in its place until all
+//! before it have left; other lines do not notice. Who is begun with next goes in rounds: one place
+//! of each group, and within a group one of each line, so that nobody who has much to do keeps the
+//! others waiting. A place that gives way to a newer one of its line leaves its turn to that.
+//! Without clock, threads or locks: whoever owns it holds it behind a lock of his own. Everything
+//! costs O(log n) in the places of one line at most.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::Hash;
@@ -37,7 +39,8 @@ pub struct Bounds {
 }
 
 impl Default for Bounds {
-    /// 16,384 places and 64 MiB, of which one group may have a quarter and a half, and 8 MiB that nobody works on yet.
+    /// 16,384 places and 64 MiB, of which one group may have a quarter and a half, and 8 MiB that
+    /// nobody works on yet.
     fn default() -> Self {
         Self {
             items: 16_384,
@@ -77,7 +80,8 @@ impl Waiting {
     }
 
     fn has_room(self, bytes: usize, items_bound: usize, bytes_bound: usize) -> bool {
-        self.items < items_bound && (self.items == 0 || self.bytes.saturating_add(bytes) <= bytes_bound)
+        self.items < items_bound
+            && (self.items == 0 || self.bytes.saturating_add(bytes) <= bytes_bound)
     }
 }
 
@@ -101,8 +105,8 @@ pub struct Pushed<T> {
     pub refused: Option<(T, Full)>,
 }
 
-/// A place that is begun. Of use for the [`InOrder`] that gave it only; one that is finished or given up means nothing
-/// any more.
+/// A place that is begun. Of use for the [`InOrder`] that gave it only; one that is finished or
+/// given up means nothing any more.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Ticket<G, L> {
     key: (G, L),
@@ -142,11 +146,7 @@ struct Line<T> {
 
 impl<T> Line<T> {
     fn new() -> Self {
-        Self {
-            places: BTreeMap::new(),
-            waits: Default::default(),
-            in_rounds: Default::default(),
-        }
+        Self { places: BTreeMap::new(), waits: Default::default(), in_rounds: Default::default() }
     }
 }
 
@@ -237,59 +237,53 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
         if let Err(full) = self.room(&key.0, bytes, false, Waiting::default()) {
             return Err((item, full));
         }
-        let place = Place {
-            bytes,
-            stage: Stage::Ready,
-            item,
-        };
+        let place = Place { bytes, stage: Stage::Ready, item };
         self.put(key, place, None);
         Ok(())
     }
 
-    /// Keeps a place, behind what its line holds, for something that is yet to be done. `bytes`: what it holds until
-    /// then. Of the places of the line and urgency that nobody works on yet only the newest `keep` stay, this one among
-    /// them, and fewer where the group has no room for its bytes otherwise; 0: all of them.
-    pub fn push_waiting(&mut self, key: (G, L), urgency: Urgency, item: T, bytes: usize, keep: usize) -> Pushed<T> {
+    /// Keeps a place, behind what its line holds, for something that is yet to be done. `bytes`:
+    /// what it holds until then. Of the places of the line and urgency that nobody works on yet
+    /// only the newest `keep` stay, this one among them, and fewer where the group has no room for
+    /// its bytes otherwise; 0: all of them.
+    pub fn push_waiting(
+        &mut self,
+        key: (G, L),
+        urgency: Urgency,
+        item: T,
+        bytes: usize,
+        keep: usize,
+    ) -> Pushed<T> {
         let freed = self.surplus(&key, urgency, bytes, keep);
         if let Err(full) = self.room(&key.0, bytes, true, freed) {
-            return Pushed {
-                gave_way: Vec::new(),
-                refused: Some((item, full)),
-            };
+            return Pushed { gave_way: Vec::new(), refused: Some((item, full)) };
         }
         let gave_way = self.withdraw(&key, urgency, freed.items);
-        let place = Place {
-            bytes,
-            stage: Stage::Waits,
-            item,
-        };
+        let place = Place { bytes, stage: Stage::Waits, item };
         self.put(key, place, Some(urgency));
-        Pushed {
-            gave_way,
-            refused: None,
-        }
+        Pushed { gave_way, refused: None }
     }
 
     /// What has to give way if one more comes and only `keep` may stay.
-    fn surplus(&self, (group, line): &(G, L), urgency: Urgency, bytes: usize, keep: usize) -> Waiting {
+    fn surplus(
+        &self,
+        (group, line): &(G, L),
+        urgency: Urgency,
+        bytes: usize,
+        keep: usize,
+    ) -> Waiting {
         let mut surplus = Waiting::default();
         let group = self.groups.get(group).filter(|_| keep > 0);
-        let Some((group, line)) = group.and_then(|group| Some((group, group.lines.get(line)?))) else {
+        let Some((group, line)) = group.and_then(|group| Some((group, group.lines.get(line)?)))
+        else {
             return surplus;
         };
         let waits = &line.waits[urgency as usize];
-        let Bounds {
-            items_of_one,
-            waiting_of_one,
-            ..
-        } = self.bounds;
+        let Bounds { items_of_one, waiting_of_one, .. } = self.bounds;
         for (at, number) in waits.iter().enumerate() {
             let too_many = waits.len() - at + 1 > keep;
             if !too_many
-                && group
-                    .waits
-                    .without(surplus)
-                    .has_room(bytes, items_of_one, waiting_of_one)
+                && group.waits.without(surplus).has_room(bytes, items_of_one, waiting_of_one)
             {
                 break;
             }
@@ -306,7 +300,8 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
             .map(|group| (group.held.without(freed), group.waits.without(freed)))
             .unwrap_or_default();
         let fits = held.has_room(bytes, bounds.items_of_one, bounds.bytes_of_one);
-        if !fits || (waits && !waiting.has_room(bytes, bounds.items_of_one, bounds.waiting_of_one)) {
+        if !fits || (waits && !waiting.has_room(bytes, bounds.items_of_one, bounds.waiting_of_one))
+        {
             return Err(Full::Group);
         }
         if !self.held.without(freed).has_room(bytes, bounds.items, bounds.bytes) {
@@ -315,7 +310,8 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
         Ok(())
     }
 
-    /// Takes the oldest waiting places out of a line. The line stays where it is in the rounds: a newer place follows.
+    /// Takes the oldest waiting places out of a line. The line stays where it is in the rounds: a
+    /// newer place follows.
     fn withdraw(&mut self, (group, line): &(G, L), urgency: Urgency, count: usize) -> Vec<T> {
         let at = urgency as usize;
         let mut gone = Vec::new();
@@ -361,8 +357,8 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
         }
     }
 
-    /// Somebody begins to work on the place whose turn it is: from now on it does not give way. Its item is his to look
-    /// at. `None`: nothing waits.
+    /// Somebody begins to work on the place whose turn it is: from now on it does not give way. Its
+    /// item is his to look at. `None`: nothing waits.
     pub fn begin(&mut self, urgency: Urgency) -> Option<(Ticket<G, L>, &mut T)> {
         let at = urgency as usize;
         let name = self.rounds[at].pop_front()?;
@@ -394,8 +390,8 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
         (place.stage == Stage::Begun).then_some(&mut place.item)
     }
 
-    /// What was to be done is done. `bytes`: what the item holds from now on; this is taken whatever the bounds are.
-    /// `false`: it was not begun.
+    /// What was to be done is done. `bytes`: what the item holds from now on; this is taken
+    /// whatever the bounds are. `false`: it was not begun.
     pub fn finish(&mut self, ticket: &Ticket<G, L>, bytes: usize) -> bool {
         let Some(group) = self.groups.get_mut(&ticket.key.0) else {
             return false;
@@ -414,14 +410,15 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
         true
     }
 
-    /// Nothing comes of a place that was begun: those behind it wait no longer. `None`: it was not begun.
+    /// Nothing comes of a place that was begun: those behind it wait no longer. `None`: it was not
+    /// begun.
     pub fn give_up(&mut self, ticket: &Ticket<G, L>) -> Option<T> {
         self.begun(ticket)?;
         self.take(&ticket.key, ticket.number)
     }
 
-    /// The oldest item of a line, if it is ready. To be called until there is none, after each push,
-    /// [`InOrder::finish`] and [`InOrder::give_up`].
+    /// The oldest item of a line, if it is ready. To be called until there is none, after each
+    /// push, [`InOrder::finish`] and [`InOrder::give_up`].
     pub fn pop_ready(&mut self, key: &(G, L)) -> Option<T> {
         let line = self.groups.get(&key.0)?.lines.get(&key.1)?;
         let (number, first) = line.places.first_key_value()?;

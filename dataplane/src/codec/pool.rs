@@ -5,11 +5,12 @@
 //!                 [ long  ] ─┘
 //! ```
 //!
-//! A turn is the leave to do one thing of its urgency. What that is shows when the turn begins, not when it is offered:
-//! the owner keeps the payloads, within bounds of his own, and may think better of it as long as they wait. So nothing
-//! here holds a payload, and a turn for which nothing is left costs nothing. Quick turns go first, but now and then one
-//! is the others'. Where there are several threads one is kept for quick turns: what came over the link does not wait
-//! until a large payload is compressed. No lock is held during a turn.
+//! A turn is the leave to do one thing of its urgency. What that is shows when the turn begins, not
+//! when it is offered: the owner keeps the payloads, within bounds of his own, and may think better
+//! of it as long as they wait. So nothing here holds a payload, and a turn for which nothing is
+//! left costs nothing. Quick turns go first, but now and then one is the others'. Where there are
+//! several threads one is kept for quick turns: what came over the link does not wait until a large
+//! payload is compressed. No lock is held during a turn.
 
 use std::io;
 use std::num::NonZeroUsize;
@@ -29,8 +30,9 @@ const TURN_AFTER: u32 = 8;
 /// Kinds of turns.
 pub(super) const URGENCIES: usize = Urgency::ALL.len();
 
-/// Threads for `flow.pool_threads`: that number, or for 0 as many as there are processors for this process, which
-/// counts the quota of its control group and its affinity mask. At least 1 and at most [`MAX_THREADS`].
+/// Threads for `flow.pool_threads`: that number, or for 0 as many as there are processors for this
+/// process, which counts the quota of its control group and its affinity mask. At least 1 and at
+/// most [`MAX_THREADS`].
 #[must_use]
 pub fn threads(configured: u16) -> usize {
     let count = match configured {
@@ -68,8 +70,8 @@ pub type Spawner = Box<dyn FnMut(String, Box<dyn FnOnce() + Send>) -> io::Result
 pub struct PoolCounters {
     /// Turns that have ended.
     pub done: u64,
-    /// Time that all threads together have spent in them. What it grows by in a second, by `threads`, is the
-    /// utilisation.
+    /// Time that all threads together have spent in them. What it grows by in a second, by
+    /// `threads`, is the utilisation.
     pub busy: Duration,
     /// Threads there are; more than wanted until those too many have ended their turns.
     pub threads: usize,
@@ -127,11 +129,8 @@ impl State {
             (true, true) if self.in_a_row >= TURN_AFTER => Urgency::Long,
             (true, _) => Urgency::Quick,
         };
-        self.in_a_row = if quick && long && urgency == Urgency::Quick {
-            self.in_a_row + 1
-        } else {
-            0
-        };
+        self.in_a_row =
+            if quick && long && urgency == Urgency::Quick { self.in_a_row + 1 } else { 0 };
         self.turns[urgency as usize] -= 1;
         self.working[urgency as usize] += 1;
         Some(urgency)
@@ -145,11 +144,16 @@ impl State {
 }
 
 impl CodecPool {
-    /// Starts threads. `run` is what they do in each turn. A panic there ends the thread, for whoever started it to notice.
+    /// Starts threads. `run` is what they do in each turn. A panic there ends the thread, for
+    /// whoever started it to notice.
     ///
     /// # Errors
     /// That of the spawner; threads that were started end.
-    pub fn start(threads: usize, spawner: Spawner, run: impl Fn(Urgency) + Send + Sync + 'static) -> io::Result<Self> {
+    pub fn start(
+        threads: usize,
+        spawner: Spawner,
+        run: impl Fn(Urgency) + Send + Sync + 'static,
+    ) -> io::Result<Self> {
         let pool = Self {
             shared: Arc::new(Shared {
                 run: Box::new(run),
@@ -164,8 +168,8 @@ impl CodecPool {
         Ok(pool)
     }
 
-    /// Changes the number of threads, at least 1 and at most [`MAX_THREADS`]. Those too many end after the turn that
-    /// they are in. Does nothing after [`CodecPool::stop`].
+    /// Changes the number of threads, at least 1 and at most [`MAX_THREADS`]. Those too many end
+    /// after the turn that they are in. Does nothing after [`CodecPool::stop`].
     ///
     /// # Errors
     /// That of the spawner; the pool goes on with the threads that it has.
@@ -178,11 +182,7 @@ impl CodecPool {
         for _ in 0..wanted {
             let Some(number) = self.shared.enrol() else { break };
             // If it is dropped without being run, the thread is struck off.
-            let worker = Worker {
-                shared: Arc::clone(&self.shared),
-                enrolled: true,
-                turn: None,
-            };
+            let worker = Worker { shared: Arc::clone(&self.shared), enrolled: true, turn: None };
             spawner(format!("blaze-codec-{number}"), Box::new(move || worker.work()))?;
         }
         Ok(())
@@ -219,7 +219,8 @@ impl CodecPool {
         }
     }
 
-    /// Forgets the turns that wait, and tells the threads to end after the one that they are in. Does not wait for them.
+    /// Forgets the turns that wait, and tells the threads to end after the one that they are in.
+    /// Does not wait for them.
     pub fn stop(&self) {
         self.shared.stop();
     }

@@ -9,7 +9,11 @@ fn payloads_go_there_and_back() {
         panic!("it was to be compressed");
     };
     assert_eq!((compressed.before, compressed.level), (80_000, 9));
-    assert!(compressed.after() < 1_000 && compressed.taken > Duration::ZERO && compressed.processor > Duration::ZERO);
+    assert!(
+        compressed.after() < 1_000
+            && compressed.taken > Duration::ZERO
+            && compressed.processor > Duration::ZERO
+    );
     let block = compressed.block.unwrap();
     assert_eq!(Work::Decompress(80_000).run(&block), Done::Decompressed(payload.into()));
     assert!(matches!(Work::Decompress(80_001).run(&block), Done::Refused(_)));

@@ -1,4 +1,5 @@
-//! Topics that are given to other flows of the layer because they carry less, and how much this flow carries itself.
+//! Topics that are given to other flows of the layer because they carry less, and how much this
+//! flow carries itself.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -15,13 +16,15 @@ use crate::world::{FlowState, Hold};
 
 /// A topic that was given to this flow by load stays at least this long, whatever the loads are.
 pub const STAY: Duration = Duration::from_secs(60);
-/// Loads must differ for this long before something is moved: longer than it takes until others have heard of a move.
+/// Loads must differ for this long before something is moved: longer than it takes until others
+/// have heard of a move.
 const PERSIST: Duration = Duration::from_secs(3);
 /// Each flow that carries more has so much time to move something first.
 const TURN: Duration = Duration::from_secs(3);
 /// A move that has not begun after this long is not to be.
 const BEGIN_WITHIN: Duration = Duration::from_secs(1);
-/// While the layer broker is away nothing comes, which says nothing of what a topic weighs; nor does the mean for so long after.
+/// While the layer broker is away nothing comes, which says nothing of what a topic weighs; nor
+/// does the mean for so long after.
 const UNWEIGHED: Duration = Duration::from_secs(10);
 /// A topic that weighs less is placed by hashing, as one that is idle.
 const LIGHT: u64 = MIN_GAP;
@@ -66,7 +69,8 @@ pub struct Moves {
     pub by_load: u64,
     /// To one that hashing prefers.
     pub settled: u64,
-    /// Moves that were begun and taken back, because what was on its way was not acknowledged in time or the other one was gone.
+    /// Moves that were begun and taken back, because what was on its way was not acknowledged in
+    /// time or the other one was gone.
     pub taken_back: u64,
     /// The last one.
     pub last: Option<LastMove>,
@@ -121,12 +125,7 @@ impl Balance {
             MoveReason::Settled
         };
         self.end_gift(topic);
-        self.moves.last = Some(LastMove {
-            topic: topic.clone(),
-            to: to.cloned(),
-            reason,
-            at: now,
-        });
+        self.moves.last = Some(LastMove { topic: topic.clone(), to: to.cloned(), reason, at: now });
     }
 
     /// A topic that was to go stays: for a while nothing is tried.
@@ -147,8 +146,8 @@ impl Balance {
         self.kept.retain(|topic, until| *until > now && carries(topic));
     }
 
-    /// Whether a topic that weighs so much stays here whatever a hash says. One that was kept for its weight stays until it is
-    /// only half as much.
+    /// Whether a topic that weighs so much stays here whatever a hash says. One that was kept for
+    /// its weight stays until it is only half as much.
     fn stays(&self, topic: &TopicName, bytes_per_s: u64, before: &Hold) -> bool {
         let light = if *before == Hold::Stays { LIGHT / 2 } else { LIGHT };
         self.got.contains_key(topic) || self.kept.contains_key(topic) || bytes_per_s >= light
@@ -156,10 +155,8 @@ impl Balance {
 
     /// Whether a topic has been here long enough to be moved by load.
     fn may_go(&self, now: Instant, topic: &TopicName) -> bool {
-        let stayed = self
-            .got
-            .get(topic)
-            .is_none_or(|since| now.saturating_duration_since(*since) >= STAY);
+        let stayed =
+            self.got.get(topic).is_none_or(|since| now.saturating_duration_since(*since) >= STAY);
         stayed && !self.kept.contains_key(topic)
     }
 
@@ -168,13 +165,14 @@ impl Balance {
         let since = *self.uneven.get_or_insert(now);
         let since = last_move.map_or(since, |last| last.max(since));
         let turn = TURN.saturating_mul(proposal.rank);
-        self.pause.is_none_or(|pause| pause <= now) && now.saturating_duration_since(since) >= PERSIST + turn
+        self.pause.is_none_or(|pause| pause <= now)
+            && now.saturating_duration_since(since) >= PERSIST + turn
     }
 }
 
 impl ControlCore {
-    /// What this flow carries, measured once a second, and the bytes per second that its wire may take: other flows of the
-    /// layer are told, and a topic may go to one that carries less.
+    /// What this flow carries, measured once a second, and the bytes per second that its wire may
+    /// take: other flows of the layer are told, and a topic may go to one that carries less.
     pub fn set_loads(&mut self, now: Instant, loads: &Loads, limit_bytes_per_s: u64) {
         self.balance.own = Load {
             out_bytes_per_s: loads.out_bytes_per_s,
@@ -186,15 +184,17 @@ impl ControlCore {
         }
         let (plans, carriers) = (&self.plans, &self.carriers);
         // What is being given up may be taken back.
-        let carries =
-            |topic: &TopicName| plans.get(topic).is_some_and(TopicPlan::carries_out) || carriers.gives_up(topic);
+        let carries = |topic: &TopicName| {
+            plans.get(topic).is_some_and(TopicPlan::carries_out) || carriers.gives_up(topic)
+        };
         self.balance.retain(now, carries);
-        let gift = self
-            .balance
-            .gift
-            .take_if(|gift| now.saturating_duration_since(gift.at) >= BEGIN_WITHIN && !carriers.gives_up(&gift.topic));
+        let gift = self.balance.gift.take_if(|gift| {
+            now.saturating_duration_since(gift.at) >= BEGIN_WITHIN
+                && !carriers.gives_up(&gift.topic)
+        });
         if let Some(gift) = gift {
-            // The one that was to get it is gone or cannot have it, or nobody asks for the topic any more.
+            // The one that was to get it is gone or cannot have it, or nobody asks for the topic
+            // any more.
             self.balance.note_taken_back(now, &gift.topic);
         }
         if self.state == FlowState::Ready && self.scopes.health(Scope::Layer) != ScopeHealth::Up {
@@ -239,7 +239,8 @@ impl ControlCore {
     /// Gives a topic away, if this flow carries too much for a while.
     fn give(&mut self, now: Instant, carried: &[TopicLoad]) {
         // While the layer broker is away nobody hears where a topic was stopped.
-        let heard = self.state == FlowState::Ready && self.scopes.health(Scope::Layer) == ScopeHealth::Up;
+        let heard =
+            self.state == FlowState::Ready && self.scopes.health(Scope::Layer) == ScopeHealth::Up;
         let idle = heard && self.balance.gift.is_none() && self.carriers.is_idle();
         let Some(proposal) = idle.then(|| self.proposal(now, carried)).flatten() else {
             self.balance.uneven = None;
@@ -264,10 +265,10 @@ impl ControlCore {
             rests: self.registry.rests(now, flow),
         };
         let others = self.registry.settled_replicas();
-        // While one of them says nothing of its load, as those of earlier versions do, nobody knows who carries too much.
-        let others: Option<Vec<Member<'_>>> = others
-            .map(|flow| Some(member(flow, self.registry.load_of(flow)?)))
-            .collect();
+        // While one of them says nothing of its load, as those of earlier versions do, nobody knows
+        // who carries too much.
+        let others: Option<Vec<Member<'_>>> =
+            others.map(|flow| Some(member(flow, self.registry.load_of(flow)?))).collect();
         let mut group = others.filter(|others| !others.is_empty())?;
         group.push(member(me, self.balance.own));
         let burdens: Vec<Burden<'_>> = carried

@@ -1,13 +1,14 @@
-//! Topics that this flow carries out of its layer: it takes them over where the one before it has stopped, and says where it
-//! stops itself.
+//! Topics that this flow carries out of its layer: it takes them over where the one before it has
+//! stopped, and says where it stops itself.
 //!
 //! ```text
 //! gives up ─► stopped at these places ─► lanes are empty ─► handed over
 //!                                     └► not within 400 ms ─► taken back: it goes on from these places
 //! ```
 //!
-//! Until it is handed over the others hear that it is still carried. So nothing that this flow has sent is overtaken by what the
-//! next one sends, and nothing is dropped that waits in a lane. A flow that is going away does not wait.
+//! Until it is handed over the others hear that it is still carried. So nothing that this flow has
+//! sent is overtaken by what the next one sends, and nothing is dropped that waits in a lane. A
+//! flow that is going away does not wait.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,8 +22,9 @@ use crate::plan::TopicPlan;
 use crate::registry::LEGACY;
 use crate::world::{Carrying, FlowState, Handover, Hold};
 
-/// What is on its way when a topic is given up must have arrived, and have been written, within this time. Well below
-/// [`DRAIN`](crate::lane::core::DRAIN), after which what waits in a lane is dropped.
+/// What is on its way when a topic is given up must have arrived, and have been written, within
+/// this time. Well below [`DRAIN`](crate::lane::core::DRAIN), after which what waits in a lane is
+/// dropped.
 const EMPTY_WITHIN: Duration = Duration::from_millis(400);
 
 /// What a plan changes of who carries a topic out of the layer.
@@ -65,7 +67,8 @@ impl Carriers {
         self.giving_up.is_empty()
     }
 
-    /// The executor has not said yet where a topic that is given up was stopped: until then nothing else can be planned for it.
+    /// The executor has not said yet where a topic that is given up was stopped: until then nothing
+    /// else can be planned for it.
     pub(super) fn awaits_places(&self, topic: &TopicName) -> bool {
         self.giving_up.get(topic).is_some_and(|giving| giving.stopped.is_none())
     }
@@ -86,8 +89,15 @@ impl Carriers {
 }
 
 impl ControlCore {
-    /// Where this flow has stopped reading a topic that it gave up, by partition; `None` where the broker has no places.
-    pub fn given_up(&mut self, now: Instant, wall_ms: u64, topic: &TopicName, places: Option<Vec<i64>>) {
+    /// Where this flow has stopped reading a topic that it gave up, by partition; `None` where the
+    /// broker has no places.
+    pub fn given_up(
+        &mut self,
+        now: Instant,
+        wall_ms: u64,
+        topic: &TopicName,
+        places: Option<Vec<i64>>,
+    ) {
         let Some(giving) = self.carriers.giving_up.get_mut(topic) else {
             return;
         };
@@ -99,15 +109,11 @@ impl ControlCore {
         }
     }
 
-    /// Topics that were given up and are to be handed over as soon as nothing of them waits in a lane: call
-    /// [`ControlCore::emptied`] then.
+    /// Topics that were given up and are to be handed over as soon as nothing of them waits in a
+    /// lane: call [`ControlCore::emptied`] then.
     #[must_use]
     pub fn emptying(&self) -> Vec<TopicName> {
-        let stopped = self
-            .carriers
-            .giving_up
-            .iter()
-            .filter(|(_, giving)| giving.stopped.is_some());
+        let stopped = self.carriers.giving_up.iter().filter(|(_, giving)| giving.stopped.is_some());
         stopped.map(|(topic, _)| topic.clone()).collect()
     }
 
@@ -162,7 +168,10 @@ impl ControlCore {
         };
         let late: Vec<TopicName> = self.emptying().into_iter().filter(late).collect();
         for topic in late {
-            tracing::info!(%topic, "what was on its way was not acknowledged in time: the topic stays");
+            tracing::info!(
+                %topic,
+                "what was on its way was not acknowledged in time: the topic stays",
+            );
             self.registry.set_hold(&topic, Hold::Stays);
             self.touch_urgent(now, &topic);
             self.plan_due(now, wall_ms);
@@ -172,18 +181,18 @@ impl ControlCore {
     }
 
     /// What a new plan means for who carries the topic.
-    pub(super) fn duty(&mut self, now: Instant, topic: &TopicName, carried: bool, plan: &TopicPlan) -> Duty {
+    pub(super) fn duty(
+        &mut self,
+        now: Instant,
+        topic: &TopicName,
+        carried: bool,
+        plan: &TopicPlan,
+    ) -> Duty {
         match (carried, plan.carries_out()) {
             (false, true) => Duty::Takes(self.take(now, topic, plan)),
             (true, false) if plan.carrier.is_some() => {
-                let to = self
-                    .balance
-                    .gift_of(topic)
-                    .filter(|to| plan.carrier.as_ref() == Some(to));
-                let giving = GivingUp {
-                    to: to.cloned(),
-                    stopped: None,
-                };
+                let to = self.balance.gift_of(topic).filter(|to| plan.carrier.as_ref() == Some(to));
+                let giving = GivingUp { to: to.cloned(), stopped: None };
                 self.carriers.giving_up.insert(topic.clone(), giving);
                 Duty::GivesUp
             }
@@ -209,7 +218,9 @@ impl ControlCore {
         let reliable = out.into_iter().any(|bridge| bridge.lane.reliable);
         let begin = match (self.registry.begin_carrying(now, topic, reliable), left) {
             // Nobody has begun where this flow stopped: the one that was to do it goes away itself.
-            (Begin::Now, Some((since, handover))) if now.saturating_duration_since(since) < LEGACY => {
+            (Begin::Now, Some((since, handover)))
+                if now.saturating_duration_since(since) < LEGACY =>
+            {
                 Begin::At(handover.offsets)
             }
             (begin, _) => begin,
@@ -219,7 +230,12 @@ impl ControlCore {
     }
 
     /// What is told of the own part in a topic.
-    pub(super) fn carrying(&mut self, now: Instant, topic: &TopicName, plan: &TopicPlan) -> Carrying {
+    pub(super) fn carrying(
+        &mut self,
+        now: Instant,
+        topic: &TopicName,
+        plan: &TopicPlan,
+    ) -> Carrying {
         if plan.carries_out() || self.carriers.giving_up.contains_key(topic) {
             return Carrying::Carries;
         }

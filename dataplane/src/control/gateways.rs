@@ -1,4 +1,5 @@
-//! Whether this flow is on the inter scope for the flows that share its layer broker, and how it comes there and goes.
+//! Whether this flow is on the inter scope for the flows that share its layer broker, and how it
+//! comes there and goes.
 //!
 //! ```text
 //! listening ─► joining ─► gateway ─► leaving (2 s: both ways) ─► closing ─┐
@@ -6,11 +7,12 @@
 //!     └───────────┴──────────────────── member ◄────────────────────────┘
 //! ```
 //!
-//! A gateway whose inter scope stops working joins anew, and meanwhile is none; likewise one that reaches nobody there while another
-//! gateway of its group does.
+//! A gateway whose inter scope stops working joins anew, and meanwhile is none; likewise one that
+//! reaches nobody there while another gateway of its group does.
 //!
-//! A flow that joins says so when it knows what is outside. One that leaves says so first: the others carry for it while what it
-//! sends itself still arrives, so nothing is missed, and repeats have the same identity.
+//! A flow that joins says so when it knows what is outside. One that leaves says so first: the
+//! others carry for it while what it sends itself still arrives, so nothing is missed, and repeats
+//! have the same identity.
 
 use std::time::{Duration, Instant};
 
@@ -34,8 +36,8 @@ const CANNOT: Duration = Duration::from_secs(15);
 const CUT_OFF: Duration = Duration::from_secs(5);
 /// Whoever leaves the inter scope has heard of the flows there from the gateways within this time.
 const HEARD_OF: Duration = Duration::from_secs(30);
-/// A flow that was of use before it became a gateway lets another one carry for it so long: well below the two seconds in which
-/// that one does, and above what messages need on their way over it.
+/// A flow that was of use before it became a gateway lets another one carry for it so long: well
+/// below the two seconds in which that one does, and above what messages need on their way over it.
 const ENTER: Duration = Duration::from_secs(1);
 /// One that leaves sends and takes what it did before for this long; its peers are told half way.
 const LEAVE: Duration = Duration::from_secs(2);
@@ -102,7 +104,8 @@ pub(super) struct Gateways {
 }
 
 impl ControlConfig {
-    /// Whether the flow is on the inter scope from its start, because nobody else could be for it, or it is to be always.
+    /// Whether the flow is on the inter scope from its start, because nobody else could be for it,
+    /// or it is to be always.
     #[must_use]
     pub fn begins_inside(&self) -> bool {
         self.inter_scope && (self.replicas.is_none() || self.gateway == AutoBool::Yes)
@@ -117,10 +120,7 @@ impl Gateways {
             (Some(_), true) if config.gateway == AutoBool::Auto => Stage::Listening,
             (Some(_), _) => Stage::Member,
         };
-        Self {
-            stage,
-            ..Self::default()
-        }
+        Self { stage, ..Self::default() }
     }
 
     pub(super) fn role(&self) -> Role {
@@ -128,7 +128,9 @@ impl Gateways {
             Stage::Gateway if self.entered.is_some() => Role::NewGateway,
             Stage::Gateway => Role::Gateway,
             Stage::Leaving { .. } => Role::Leaving,
-            Stage::Listening | Stage::Joining { .. } | Stage::Closing | Stage::Member => Role::Member,
+            Stage::Listening | Stage::Joining { .. } | Stage::Closing | Stage::Member => {
+                Role::Member
+            }
         }
     }
 
@@ -139,11 +141,7 @@ impl Gateways {
 
     /// What it says that its node file says.
     pub(super) fn setting(&self, config: &ControlConfig) -> AutoBool {
-        if self.cannot || !config.inter_scope {
-            AutoBool::No
-        } else {
-            config.gateway
-        }
+        if self.cannot || !config.inter_scope { AutoBool::No } else { config.gateway }
     }
 
     /// Whether flows elsewhere that are unknown now may become known another way in a moment.
@@ -152,8 +150,7 @@ impl Gateways {
     }
 
     fn heard_for(&self, now: Instant) -> Duration {
-        self.heard_since
-            .map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
+        self.heard_since.map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
     }
 
     /// How long the same has been chosen.
@@ -181,15 +178,13 @@ impl ControlCore {
         }
     }
 
-    /// The inter scope does not work here, and has not for a while: others are to be on it for the group.
+    /// The inter scope does not work here, and has not for a while: others are to be on it for the
+    /// group.
     pub fn lost(&mut self, now: Instant) {
         let is_one_of_many = self.config.replicas.is_some();
         if is_one_of_many && matches!(self.gateways.stage, Stage::Gateway | Stage::Joining { .. }) {
             self.gateways.cannot = true;
-            let stage = Stage::Joining {
-                since: now,
-                there: None,
-            };
+            let stage = Stage::Joining { since: now, there: None };
             self.enter(now, stage);
         }
     }
@@ -232,16 +227,9 @@ impl ControlCore {
         if !concerned || self.state == FlowState::Draining {
             return;
         }
-        self.gateways.cut_off = if self.registry.is_cut_off() {
-            self.gateways.cut_off.or(Some(now))
-        } else {
-            None
-        };
-        if self
-            .gateways
-            .entered
-            .is_some_and(|at| now.saturating_duration_since(at) >= ENTER)
-        {
+        self.gateways.cut_off =
+            if self.registry.is_cut_off() { self.gateways.cut_off.or(Some(now)) } else { None };
+        if self.gateways.entered.is_some_and(|at| now.saturating_duration_since(at) >= ENTER) {
             self.gateways.entered = None;
             self.enter(now, self.gateways.stage);
         }
@@ -249,10 +237,7 @@ impl ControlCore {
             Stage::Joining { since, there } => self.join(now, since, there),
             Stage::Gateway if self.is_cut_off(now) => {
                 self.gateways.cannot = true;
-                let stage = Stage::Joining {
-                    since: now,
-                    there: Some(now),
-                };
+                let stage = Stage::Joining { since: now, there: Some(now) };
                 self.enter(now, stage);
             }
             Stage::Leaving { since } => {
@@ -282,10 +267,7 @@ impl ControlCore {
             (Stage::Member, Choice::Welcome) if held < WELCOME_FOR => return,
             (Stage::Listening | Stage::Member, Choice::Needed | Choice::Welcome) => {
                 self.outputs.push_back(Output::Inter { join: true });
-                Stage::Joining {
-                    since: now,
-                    there: None,
-                }
+                Stage::Joining { since: now, there: None }
             }
             (Stage::Gateway, Choice::No) if held >= UNNEEDED_FOR => Stage::Leaving { since: now },
             _ => return,
@@ -302,8 +284,9 @@ impl ControlCore {
             }
             return;
         };
-        // It is there, but of no use. Whoever has just come reaches nobody for a moment: a flow that was ready meanwhile would send
-        // over the layer broker first, and its messages would take two ways when it becomes a gateway.
+        // It is there, but of no use. Whoever has just come reaches nobody for a moment: a flow
+        // that was ready meanwhile would send over the layer broker first, and its messages would
+        // take two ways when it becomes a gateway.
         let listened = now.saturating_duration_since(there);
         let cut_off = self.gateways.cut_off.is_some();
         let cannot = cut_off && (self.gateways.cannot || listened >= CUT_OFF);
@@ -344,7 +327,9 @@ impl ControlCore {
             _ if self.state == FlowState::Draining => FlowState::Draining,
             Stage::Gateway => self.state,
             // Half way its peers are told to send elsewhere.
-            Stage::Leaving { since } if now.saturating_duration_since(since) < LEAVE / 2 => self.state,
+            Stage::Leaving { since } if now.saturating_duration_since(since) < LEAVE / 2 => {
+                self.state
+            }
             Stage::Leaving { .. } | Stage::Closing => FlowState::Draining,
             Stage::Listening | Stage::Joining { .. } | Stage::Member => FlowState::Starting,
         };

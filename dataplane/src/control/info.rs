@@ -9,8 +9,9 @@ use crate::lane::path::{BareInfo, TopicInfo};
 use crate::registry::{LeaseView, Registry, Terms};
 use crate::world::{FlowView, OriginFilter};
 
-/// The largest payload in bytes that any flow announces of a topic. Of which connection a message goes to its broker is decided by
-/// that where it arrives as well: a flow whose own services only ask for it has no other way to know before one has come.
+/// The largest payload in bytes that any flow announces of a topic. Of which connection a message
+/// goes to its broker is decided by that where it arrives as well: a flow whose own services only
+/// ask for it has no other way to know before one has come.
 pub(super) fn announced_bytes(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> Option<u64> {
     let entries = holders.iter().filter_map(|(_, view)| view.topics.get(topic));
     let scopes = entries.flat_map(|entry| [&entry.node, &entry.layer, &entry.outside]);
@@ -35,10 +36,7 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
         node: bare_info(&of(Scope::Node)),
         layer: bare_info(&of(Scope::Layer)),
         max_bytes: offers().filter_map(|(_, bytes)| bytes).max(),
-        rate_hz: offers()
-            .map(|(rate, _)| rate)
-            .sum::<Option<f64>>()
-            .filter(|_| !all.is_empty()),
+        rate_hz: offers().map(|(rate, _)| rate).sum::<Option<f64>>().filter(|_| !all.is_empty()),
         access: registry.access_of(topic),
     }
 }
@@ -51,8 +49,8 @@ pub(super) struct Sources {
     pub(super) more: bool,
 }
 
-/// Who advertises a topic as transient_local, of flows that hold it and are not forgotten. One that is down is still one of
-/// them: its services may well live.
+/// Who advertises a topic as transient_local, of flows that hold it and are not forgotten. One that
+/// is down is still one of them: its services may well live.
 pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> Sources {
     let mut found = Sources::default();
     for (flow, view) in holders {
@@ -65,7 +63,9 @@ pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicNam
         let offers = scopes
             .into_iter()
             .filter_map(|(layer, scope)| Some((layer, scope.advertise.as_ref()?)));
-        for (layer, offer) in offers.filter(|(_, offer)| offer.durability == Durability::TransientLocal) {
+        for (layer, offer) in
+            offers.filter(|(_, offer)| offer.durability == Durability::TransientLocal)
+        {
             found.more |= offer.more_sources;
             found.known.extend(offer.sources.iter().map(|source| OriginFilter {
                 layer: layer.clone(),
@@ -77,7 +77,8 @@ pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicNam
     found
 }
 
-/// The header of what comes without one from a scope: where several advertise, nobody knows who of them it was.
+/// The header of what comes without one from a scope: where several advertise, nobody knows who of
+/// them it was.
 fn bare_info(advertised: &[LeaseView<'_>]) -> BareInfo {
     let Some(first) = advertised.first() else {
         return BareInfo::default();

@@ -6,8 +6,8 @@
 //! peers up, suspect, down ─────────┘                                                             └─► events, answers
 //! ```
 //!
-//! Without input or output: what it wants done comes out of [`ControlCore::poll`]. Production carries it out with tasks and
-//! brokers, the simulated network with plain calls.
+//! Without input or output: what it wants done comes out of [`ControlCore::poll`]. Production
+//! carries it out with tasks and brokers, the simulated network with plain calls.
 
 mod balance;
 mod carrying;
@@ -171,14 +171,15 @@ impl ControlCore {
         self.touch_all(now);
     }
 
-    /// The layer broker has a topic of somebody else's with the name that this one would have: it is blocked there.
+    /// The layer broker has a topic of somebody else's with the name that this one would have: it
+    /// is blocked there.
     pub fn refuse_name(&mut self, now: Instant, topic: TopicName, other: String) {
         self.registry.note_foreign_name(&topic, other);
         self.touch(now, BTreeSet::from([topic]));
     }
 
-    /// Changes who may advertise and request what. Leases that are no longer allowed end; every topic is planned anew, because
-    /// the rules hold for requesters of other flows, too.
+    /// Changes who may advertise and request what. Leases that are no longer allowed end; every
+    /// topic is planned anew, because the rules hold for requesters of other flows, too.
     pub fn set_access(&mut self, now: Instant, wall_ms: u64, access: AccessRules) {
         let ended = self.registry.set_access(now, access);
         for event in &ended.events {
@@ -209,11 +210,7 @@ impl ControlCore {
         let shared = scope == Scope::Layer && self.config.layer_answers_need_id;
         for answer in outcome.answers.into_iter().filter(|answer| answer.designated) {
             let body = Bytes::from(answer.body.to_string());
-            let channel = if shared {
-                ChannelName::shared_reply()
-            } else {
-                answer.reply_to
-            };
+            let channel = if shared { ChannelName::shared_reply() } else { answer.reply_to };
             self.outputs.push_back(Output::Publish { scope, channel, body });
         }
         for event in &outcome.events {
@@ -244,7 +241,9 @@ impl ControlCore {
                 self.registry.set_reach(now, &flow, Reach::Up)
             }
             LinkEvent::PeerSuspect { flow } => self.registry.set_reach(now, &flow, Reach::Suspect),
-            LinkEvent::PeerDown { endpoint, .. } => self.registry.set_reach(now, &endpoint.flow, Reach::Down),
+            LinkEvent::PeerDown { endpoint, .. } => {
+                self.registry.set_reach(now, &endpoint.flow, Reach::Down)
+            }
             LinkEvent::PeerForgotten(Endpoint { flow, .. }) => {
                 self.addresses.remove(&flow);
                 self.registry.forget_link(now, &flow)
@@ -261,7 +260,8 @@ impl ControlCore {
         self.tell_layer_away(now);
         let listened = self.has_listened(now);
         let knows_leases = !LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
-        if self.state == FlowState::Starting && listened && knows_leases && self.knows_replicas(now) {
+        if self.state == FlowState::Starting && listened && knows_leases && self.knows_replicas(now)
+        {
             self.set_state(now, FlowState::Ready);
         }
         let expired = self.registry.expire(now);
@@ -283,19 +283,13 @@ impl ControlCore {
         self.take_back_late(now, wall_ms);
         self.plan_due(now, wall_ms);
         for (to, body) in self.registry.poll(now) {
-            self.outputs.push_back(Output::Link {
-                to,
-                body: Box::new(body),
-            });
+            self.outputs.push_back(Output::Link { to, body: Box::new(body) });
         }
         self.tell_replicas(now);
         let announced = self.registry.announced();
         if announced != self.announced {
             self.announced = announced;
-            self.outputs.push_back(Output::Announce {
-                version: announced.0,
-                digest: announced.1,
-            });
+            self.outputs.push_back(Output::Announce { version: announced.0, digest: announced.1 });
         }
     }
 
@@ -333,12 +327,7 @@ impl ControlCore {
 }
 
 fn event(event: EventKind, topic: Option<TopicName>) -> EventDraft {
-    EventDraft {
-        event,
-        topic,
-        code: "",
-        detail: String::new(),
-    }
+    EventDraft { event, topic, code: "", detail: String::new() }
 }
 
 #[cfg(test)]

@@ -44,8 +44,8 @@ pub enum Output {
         plan: TopicPlan,
         /// What local advertisements say.
         info: Box<TopicInfo>,
-        /// What changes of who carries it out of the layer. After [`Duty::GivesUp`] call [`ControlCore::given_up`] at once, and
-        /// then look at [`ControlCore::emptying`].
+        /// What changes of who carries it out of the layer. After [`Duty::GivesUp`] call
+        /// [`ControlCore::given_up`] at once, and then look at [`ControlCore::emptying`].
         duty: Duty,
     },
     /// Put a message on the channel that flows share on the layer broker.
@@ -64,8 +64,8 @@ pub enum Output {
     },
     /// Say this state in Hello on the inter scope.
     State(FlowState),
-    /// Join the inter scope, and call [`ControlCore::joined`], or leave it, once what is on its way has left, and call
-    /// [`ControlCore::left`].
+    /// Join the inter scope, and call [`ControlCore::joined`], or leave it, once what is on its way
+    /// has left, and call [`ControlCore::left`].
     Inter {
         /// Join it.
         join: bool,
@@ -79,7 +79,8 @@ pub enum Output {
     LayerAway(bool),
     /// Let the broker of a scope keep or forget a lease.
     SaveLease(UnsavedLease),
-    /// Forget what is kept of writers for late joiners: their service no longer advertises the topic.
+    /// Forget what is kept of writers for late joiners: their service no longer advertises the
+    /// topic.
     ForgetWriters {
         /// The topic.
         topic: TopicName,
@@ -119,7 +120,8 @@ pub struct ControlConfig {
     pub node_scope: bool,
     /// Its layer broker.
     pub layer_scope: Option<LayerScopeId>,
-    /// Flows that share the layer broker have a channel of their own there, on a broker of this kind.
+    /// Flows that share the layer broker have a channel of their own there, on a broker of this
+    /// kind.
     pub replicas: Option<LayerScope>,
     /// What the node file says of this flow as a gateway.
     pub gateway: AutoBool,

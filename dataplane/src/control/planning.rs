@@ -38,14 +38,11 @@ impl ControlCore {
     /// Topics are planned when nothing more has changed for a while.
     pub(super) fn touch(&mut self, now: Instant, topics: BTreeSet<TopicName>) {
         for topic in topics {
-            self.dirty
-                .entry(topic)
-                .and_modify(|dirty| dirty.last = now)
-                .or_insert(Dirty {
-                    first: now,
-                    last: now,
-                    urgent: false,
-                });
+            self.dirty.entry(topic).and_modify(|dirty| dirty.last = now).or_insert(Dirty {
+                first: now,
+                last: now,
+                urgent: false,
+            });
         }
     }
 
@@ -109,22 +106,17 @@ impl ControlCore {
 
     fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
         let previous = self.plans.get(topic);
-        let Draft {
-            mut plan,
-            durable,
-            max_bytes,
-            is_known,
-        } = draft;
-        if is_known && previous == Some(&plan) && plan.bridges.is_empty() && self.is_idle(topic, &durable.known) {
+        let Draft { mut plan, durable, max_bytes, is_known } = draft;
+        if is_known
+            && previous == Some(&plan)
+            && plan.bridges.is_empty()
+            && self.is_idle(topic, &durable.known)
+        {
             return;
         }
         let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
         let carried = previous.is_some_and(TopicPlan::carries_out);
-        let fault = if plan.uses_layer() {
-            self.registry.put_on_layer(topic).err()
-        } else {
-            None
-        };
+        let fault = if plan.uses_layer() { self.registry.put_on_layer(topic).err() } else { None };
         if let Some(fault) = &fault {
             plan.block_layer(&self.config.me, fault.code(), &format!("{topic} {fault}"));
         }
@@ -147,24 +139,16 @@ impl ControlCore {
         routes.truncate(MAX_ROUTES);
         self.registry.set_route_state(now, topic, routes);
         self.update_channels(topic);
-        self.outputs.push_back(Output::Plan {
-            topic: topic.clone(),
-            plan,
-            info,
-            duty,
-        });
+        self.outputs.push_back(Output::Plan { topic: topic.clone(), plan, info, duty });
         if had_route != has_route {
-            let kind = if has_route {
-                EventKind::RouteUp
-            } else {
-                EventKind::RouteDown
-            };
+            let kind = if has_route { EventKind::RouteUp } else { EventKind::RouteDown };
             self.tell(&event(kind, Some(topic.clone())), wall_ms);
         }
     }
 
-    /// Whether a topic without bridges concerns nobody here: no lease, nothing that is kept, told or handed over. That is most
-    /// of a large fleet's topics, and they are looked at again every few seconds.
+    /// Whether a topic without bridges concerns nobody here: no lease, nothing that is kept, told
+    /// or handed over. That is most of a large fleet's topics, and they are looked at again every
+    /// few seconds.
     fn is_idle(&self, topic: &TopicName, durable: &BTreeSet<OriginFilter>) -> bool {
         self.registry.leases_of(topic).next().is_none()
             && self.durable.get(topic).is_none_or(|before| before == durable)
@@ -172,16 +156,15 @@ impl ControlCore {
             && !self.carriers.knows(topic)
     }
 
-    /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is to be forgotten. Whoever is
-    /// only not named any more is not gone.
+    /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is
+    /// to be forgotten. Whoever is only not named any more is not gone.
     fn forget_writers(&mut self, now: Instant, topic: &TopicName, durable: Sources) {
         let before = self.durable.remove(topic).unwrap_or_default();
         let Sources { mut known, more } = durable;
         let gone: Vec<OriginFilter> = before.difference(&known).cloned().collect();
         let unnamed = more || self.gateways.has_just_left(now);
-        let (stay, gone): (Vec<_>, Vec<_>) = gone
-            .into_iter()
-            .partition(|of| unnamed || self.registry.may_return(now, of));
+        let (stay, gone): (Vec<_>, Vec<_>) =
+            gone.into_iter().partition(|of| unnamed || self.registry.may_return(now, of));
         if known.len() + stay.len() <= MAX_UNNAMED {
             known.extend(stay);
             self.forget_sources(topic, gone, &known);
@@ -193,7 +176,12 @@ impl ControlCore {
         }
     }
 
-    fn forget_sources(&mut self, topic: &TopicName, gone: Vec<OriginFilter>, known: &BTreeSet<OriginFilter>) {
+    fn forget_sources(
+        &mut self,
+        topic: &TopicName,
+        gone: Vec<OriginFilter>,
+        known: &BTreeSet<OriginFilter>,
+    ) {
         for of in gone {
             self.outputs.push_back(Output::ForgetWriters {
                 topic: topic.clone(),

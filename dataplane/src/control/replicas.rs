@@ -1,5 +1,5 @@
-//! Flows of one layer that share a layer broker with a channel of their own (`blaze/flow/peers`): what they say there,
-//! and what follows.
+//! Flows of one layer that share a layer broker with a channel of their own (`blaze/flow/peers`):
+//! what they say there, and what follows.
 //!
 //! ```text
 //! Hello every 500 ms and when the state changes ─┐
@@ -12,7 +12,9 @@ use std::time::{Duration, Instant};
 use blaze_domain::FlowId;
 use blaze_domain::node_file::AutoBool;
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Body, Channel, Egress, Gateway, Goodbye, Hello, LayerScope, State};
+use blaze_proto::link::link_control::{
+    Body, Channel, Egress, Gateway, Goodbye, Hello, LayerScope, State,
+};
 use bytes::Bytes;
 use prost::Message as _;
 
@@ -23,7 +25,8 @@ use crate::link::kind_to_wire;
 const HELLO_EVERY: Duration = Duration::from_millis(500);
 /// A flow waits so long for what others have announced before it is ready without it.
 pub(super) const KNOW_OTHERS: Duration = Duration::from_secs(2);
-/// Largest message that is looked at, in bytes: those of flows have at most 1,200, and the names of sender and addressee.
+/// Largest message that is looked at, in bytes: those of flows have at most 1,200, and the names of
+/// sender and addressee.
 const MAX_MESSAGE: usize = 4096;
 
 /// What another flow said on the channel of the layer broker; `None` where it cannot be read.
@@ -48,17 +51,20 @@ pub(super) struct Replicas {
 
 impl Replicas {
     pub(super) fn new(began: u64) -> Self {
-        Self {
-            began,
-            ..Self::default()
-        }
+        Self { began, ..Self::default() }
     }
 }
 
 impl ControlCore {
-    /// Takes what another flow said on the channel of the layer broker, as [`read_replica_message`] gives it; the server took it at
-    /// `appended_ms` of its clock. Whether a topic changed by it: nothing else is in a hurry, the next tick is soon enough.
-    pub fn replica_message(&mut self, now: Instant, message: Option<LinkControl>, appended_ms: Option<i64>) -> bool {
+    /// Takes what another flow said on the channel of the layer broker, as [`read_replica_message`]
+    /// gives it; the server took it at `appended_ms` of its clock. Whether a topic changed by it:
+    /// nothing else is in a hurry, the next tick is soon enough.
+    pub fn replica_message(
+        &mut self,
+        now: Instant,
+        message: Option<LinkControl>,
+        appended_ms: Option<i64>,
+    ) -> bool {
         let Some(message) = message else {
             self.replicas.refused += 1;
             return false;
@@ -83,9 +89,9 @@ impl ControlCore {
             return false;
         }
         let changed = match body {
-            Body::Hello(hello) => self
-                .registry
-                .on_layer_hello(now, &from, &hello, channel.began, appended_ms),
+            Body::Hello(hello) => {
+                self.registry.on_layer_hello(now, &from, &hello, channel.began, appended_ms)
+            }
             body => self.registry.on_layer_control(now, &from, channel.epoch, body),
         };
         let any = !changed.is_empty();
@@ -124,7 +130,8 @@ impl ControlCore {
         }
     }
 
-    /// Whether what the flows next to this one have announced is known, or was waited for long enough.
+    /// Whether what the flows next to this one have announced is known, or was waited for long
+    /// enough.
     pub(super) fn knows_replicas(&self, now: Instant) -> bool {
         self.config.replicas.is_none()
             || self.registry.knows_replicas()
@@ -207,9 +214,7 @@ impl ControlCore {
                 to: to.map(ToString::to_string).unwrap_or_default(),
             }),
         };
-        self.outputs.push_back(Output::Replicas {
-            body: Bytes::from(message.encode_to_vec()),
-            deadline,
-        });
+        self.outputs
+            .push_back(Output::Replicas { body: Bytes::from(message.encode_to_vec()), deadline });
     }
 }

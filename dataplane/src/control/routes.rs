@@ -7,7 +7,11 @@ use super::ScopeHealth;
 use crate::plan::{Bridge, Destination, Target, TopicPlan};
 
 /// What this flow does for a topic.
-pub(super) fn route_states(me: &FlowId, plan: &TopicPlan, health: impl Fn(Scope) -> ScopeHealth) -> Vec<RouteState> {
+pub(super) fn route_states(
+    me: &FlowId,
+    plan: &TopicPlan,
+    health: impl Fn(Scope) -> ScopeHealth,
+) -> Vec<RouteState> {
     let carried = plan.bridges.iter().map(|bridge| {
         let (to_layer, receiver) = match &bridge.to {
             Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string()),

@@ -1,4 +1,5 @@
-//! What the control core knows of the brokers of its local scopes, and what follows for leases, plans and channels.
+//! What the control core knows of the brokers of its local scopes, and what follows for leases,
+//! plans and channels.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -14,7 +15,8 @@ use crate::registry::Restored;
 /// The local scopes.
 pub(super) const LOCAL: [Scope; 2] = [Scope::Node, Scope::Layer];
 
-/// Others are told of a layer broker that has not answered for this long: it is as long as they need to notice that a flow has died.
+/// Others are told of a layer broker that has not answered for this long: it is as long as they
+/// need to notice that a flow has died.
 const AWAY: Duration = Duration::from_millis(2500);
 
 /// Whether the broker of a scope can be used.
@@ -101,7 +103,12 @@ impl ControlCore {
     }
 
     /// Takes the leases that the broker of a scope has kept.
-    pub fn restore_leases(&mut self, now: Instant, scope: Scope, kept: &[(String, Bytes)]) -> Restored {
+    pub fn restore_leases(
+        &mut self,
+        now: Instant,
+        scope: Scope,
+        kept: &[(String, Bytes)],
+    ) -> Restored {
         let restored = self.registry.restore(now, scope, kept);
         self.skipped_leases += restored.skipped;
         self.touch(now, restored.changed.clone());
@@ -118,7 +125,8 @@ impl ControlCore {
         self.outputs.extend(unsaved.into_iter().map(Output::SaveLease));
     }
 
-    /// Lets brokers make the channels of topics that are leased on them or that a bridge writes, and release the others.
+    /// Lets brokers make the channels of topics that are leased on them or that a bridge writes,
+    /// and release the others.
     pub(super) fn update_channels(&mut self, topic: &TopicName) {
         for scope in LOCAL {
             if !self.config.lease_stores.contains(&scope) {
@@ -126,11 +134,7 @@ impl ControlCore {
             }
             let leased = self.registry.channel_depth(topic, scope);
             let bridges = self.plans.get(topic).map_or(&[][..], |plan| &plan.bridges);
-            let written = bridges
-                .iter()
-                .filter(|bridge| writes(bridge, scope))
-                .map(depth_of)
-                .max();
+            let written = bridges.iter().filter(|bridge| writes(bridge, scope)).map(depth_of).max();
             let wanted = leased.max(written);
             let key = (scope, topic.clone());
             if self.scopes.prepared.get(&key).copied() == wanted {

@@ -47,11 +47,7 @@ impl Bench {
             rules: PlanRules::default(),
             access: AccessRules::default(),
         });
-        Self {
-            core: ControlCore::new(config, now),
-            now,
-            outputs: Vec::new(),
-        }
+        Self { core: ControlCore::new(config, now), now, outputs: Vec::new() }
     }
 
     /// Nothing is kept by its brokers.
@@ -108,7 +104,9 @@ impl Bench {
     /// What was asked of brokers' channels since the last call.
     fn channels(&mut self) -> Vec<String> {
         self.wanted(|output| match output {
-            Output::Prepare { scope, channel, depth } => Some(format!("+{scope} {channel} {depth}")),
+            Output::Prepare { scope, channel, depth } => {
+                Some(format!("+{scope} {channel} {depth}"))
+            }
             Output::Release { scope, channel } => Some(format!("-{scope} {channel}")),
             _ => None,
         })
@@ -128,18 +126,11 @@ impl Bench {
         self.core.link_event(self.now, LinkEvent::Control { from: told, body });
     }
 
-    /// `fog/fog-2` says something on the channel of the layer broker. Whether that is a reason to work.
+    /// `fog/fog-2` says something on the channel of the layer broker. Whether that is a reason to
+    /// work.
     fn fog_2_says(&mut self, body: Body, appended_ms: Option<i64>) -> bool {
-        let channel = Channel {
-            from: FOG_2.to_owned(),
-            epoch: 1,
-            began: 1,
-            to: String::new(),
-        };
-        let message = LinkControl {
-            body: Some(body),
-            channel: Some(channel),
-        };
+        let channel = Channel { from: FOG_2.to_owned(), epoch: 1, began: 1, to: String::new() };
+        let message = LinkControl { body: Some(body), channel: Some(channel) };
         let read = read_replica_message(&message.encode_to_vec());
         self.core.replica_message(self.now, read, appended_ms)
     }
@@ -152,7 +143,8 @@ impl Bench {
 
     fn routes(&self, topic: &str) -> Vec<(String, String)> {
         let plan = &self.core.plans()[&topic.parse::<TopicName>().unwrap()];
-        let states = route_states(&self.core.config.me, plan, |scope| self.core.scopes.health(scope));
+        let states =
+            route_states(&self.core.config.me, plan, |scope| self.core.scopes.health(scope));
         states.into_iter().map(|state| (state.step, state.code)).collect()
     }
 }
@@ -162,11 +154,7 @@ const FOG_2: &str = "fog/fog-2";
 
 /// An announcement that services of a node ask for a topic.
 fn asks_for(topic: &str) -> Entry {
-    Entry {
-        topic: topic.to_owned(),
-        node_request: Some(Request::default()),
-        ..Entry::default()
-    }
+    Entry { topic: topic.to_owned(), node_request: Some(Request::default()), ..Entry::default() }
 }
 
 fn lease(op: &str, topic: &str) -> Value {
@@ -181,7 +169,9 @@ fn a_flow_is_starting_until_all_kept_leases_are_read() {
     let value = Bytes::from(lease("advertise", "imu/data").to_string());
     let kept = [("advertise|imu/data|fog|fog-1|a|0".to_owned(), value)];
     assert_eq!(bench.core.restore_leases(bench.now, Scope::Node, &kept).restored, 1);
-    assert!(!bench.core.is_reading_leases(Scope::Node) && bench.core.is_reading_leases(Scope::Layer));
+    assert!(
+        !bench.core.is_reading_leases(Scope::Node) && bench.core.is_reading_leases(Scope::Layer)
+    );
     bench.step(20);
     assert_eq!(bench.core.state(), FlowState::Starting);
     let value = Bytes::from(lease("request", "imu/data").to_string());
@@ -191,8 +181,9 @@ fn a_flow_is_starting_until_all_kept_leases_are_read() {
     assert_eq!(bench.core.state(), FlowState::Ready);
     bench.step(300);
     assert_eq!(bench.bridges("imu/data"), ["node>Layer"]);
-    let other =
-        |output: &Output| matches!(output, Output::Publish { .. }) && !format!("{output:?}").contains("route_up");
+    let other = |output: &Output| {
+        matches!(output, Output::Publish { .. }) && !format!("{output:?}").contains("route_up")
+    };
     assert!(!bench.wants(other), "no refusal, no answer: {:?}", bench.outputs);
     assert_eq!(bench.channels(), ["+node imu/data 0", "+layer imu/data 0"]);
 }
@@ -266,11 +257,11 @@ fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
         .filter_map(|output| match output {
             Output::Prepare { depth: 3, .. } => Some("prepare"),
             Output::SaveLease(lease) if lease.scope == Scope::Layer => Some("save"),
-            Output::Publish {
-                scope: Scope::Layer,
-                channel,
-                ..
-            } if *channel == ChannelName::shared_reply() => Some("answer"),
+            Output::Publish { scope: Scope::Layer, channel, .. }
+                if *channel == ChannelName::shared_reply() =>
+            {
+                Some("answer")
+            }
             _ => None,
         })
         .collect();
@@ -296,7 +287,8 @@ fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
 #[test]
 fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     let mut bench = Bench::ready();
-    // Another node of the layer asks for `imu_data` of this node: only the way over Kafka is between them.
+    // Another node of the layer asks for `imu_data` of this node: only the way over Kafka is
+    // between them.
     let hello = Hello {
         layer_scope_id: LayerScopeId::kafka("").0,
         registry_version: 1,
@@ -312,10 +304,7 @@ fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     bench.send(Scope::Node, &lease("advertise", "imu_data"));
     bench.step(300);
     assert_eq!(bench.bridges("imu_data"), [""; 0]);
-    assert_eq!(
-        bench.routes("imu_data"),
-        [("plan".to_owned(), "name_collision".to_owned())]
-    );
+    assert_eq!(bench.routes("imu_data"), [("plan".to_owned(), "name_collision".to_owned())]);
     let blocked = &bench.core.plans()[&"imu_data".parse::<TopicName>().unwrap()].blocked;
     assert!(blocked[0].detail.contains("imu/data"), "{blocked:?}");
     bench.send(Scope::Layer, &lease("withdraw", "imu/data"));
@@ -353,15 +342,14 @@ fn who_may_not_advertise_is_told_and_leaves_no_lease() {
         }
         _ => None,
     });
-    let [answer] = answers.as_slice() else {
-        panic!("{answers:?}")
-    };
+    let [answer] = answers.as_slice() else { panic!("{answers:?}") };
     assert_eq!(answer["error"]["code"], "access_denied", "{answer}");
     assert_eq!(answer["error"]["pointer"], "/service");
     assert_eq!(bench.core.registry().lease_count(), 0);
     assert_eq!(bench.core.refused, 1);
     let topic = "cmd/vel".parse().unwrap();
-    let reasons: Vec<LapseReason> = bench.core.registry().lapsed(&topic).map(|lease| lease.reason).collect();
+    let reasons: Vec<LapseReason> =
+        bench.core.registry().lapsed(&topic).map(|lease| lease.reason).collect();
     assert_eq!(reasons, [LapseReason::Denied]);
     let mut allowed = lease("advertise", "cmd/vel");
     allowed["service"] = "joystick".into();

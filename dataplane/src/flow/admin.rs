@@ -1,4 +1,5 @@
-//! `GET /v1/…`: what the flow knows and does, as JSON. Each answer also names the flow, its epoch and the time.
+//! `GET /v1/…`: what the flow knows and does, as JSON. Each answer also names the flow, its epoch
+//! and the time.
 
 mod allocation;
 mod peers;
@@ -91,10 +92,7 @@ async fn topics(State(shared): App) -> Json<Value> {
                     .flat_map(|a| remote_advertise(remote.flow, remote.scope, a)),
             );
             requested.extend(
-                remote
-                    .request
-                    .iter()
-                    .map(|r| remote_request(remote.flow, remote.scope, r)),
+                remote.request.iter().map(|r| remote_request(remote.flow, remote.scope, r)),
             );
         }
         if advertised.is_empty() && requested.is_empty() {
@@ -112,7 +110,8 @@ async fn topics(State(shared): App) -> Json<Value> {
         };
         let (rate_hz, bytes_per_s) = rates.get(&topic).copied().unwrap_or_default();
         rows.push(json!({
-            "topic": topic, "state": state, "rate_hz": rounded(rate_hz), "bytes_per_s": bytes_per_s.round(),
+            "topic": topic, "state": state, "rate_hz": rounded(rate_hz),
+            "bytes_per_s": bytes_per_s.round(),
             "advertised": advertised, "requested": requested,
         }));
     }
@@ -128,27 +127,28 @@ fn lease_row(shared: &Shared, now: Instant, lease: &LeaseView<'_>) -> Value {
     let key = lease.key;
     let quality = lease.quality();
     let mut row = json!({
-        "layer": key.layer, "node": key.node.as_ref().map_or("", |node| node.as_str()), "service": key.service,
+        "layer": key.layer, "node": key.node.as_ref().map_or("", |node| node.as_str()),
+        "service": key.service,
         "instance": key.instance, "scope": key.scope, "broker": broker_of(shared, key.scope),
     });
     let terms = match lease.terms {
-        Terms::Advertise { rate_hz, max_bytes, .. } => json!({"rate_hz": rate_hz, "max_bytes": max_bytes}),
-        Terms::Request {
-            max_rate_hz,
-            bare,
-            from,
-            ..
-        } => json!({
+        Terms::Advertise { rate_hz, max_bytes, .. } => {
+            json!({"rate_hz": rate_hz, "max_bytes": max_bytes})
+        }
+        Terms::Request { max_rate_hz, bare, from, .. } => json!({
             "max_rate_hz": max_rate_hz, "lifespan_ms": quality.lifespan_ms, "bare": bare,
-            "from": (!from.is_any()).then(|| json!({"layer": from.layer, "node": from.node, "service": from.service})),
+            "from": (!from.is_any())
+                .then(|| json!({"layer": from.layer, "node": from.node, "service": from.service})),
         }),
     };
     extend(&mut row, terms);
     extend(
         &mut row,
         json!({
-            "priority": quality.priority, "reliability": quality.reliability, "durability": quality.durability,
-            "expires_in_s": lease.expires_in(now).map(|left| rounded(left.as_secs_f64())), "local": true,
+            "priority": quality.priority, "reliability": quality.reliability,
+            "durability": quality.durability,
+            "expires_in_s": lease.expires_in(now).map(|left| rounded(left.as_secs_f64())),
+            "local": true,
         }),
     );
     row
@@ -161,29 +161,38 @@ fn extend(row: &mut Value, more: Value) {
 }
 
 /// What another flow announced: its services merged, so that per-service rates are not known.
-fn remote_advertise(flow: &blaze_domain::FlowId, scope: Scope, advertise: &Advertise) -> Vec<Value> {
+fn remote_advertise(
+    flow: &blaze_domain::FlowId,
+    scope: Scope,
+    advertise: &Advertise,
+) -> Vec<Value> {
     let row = |source: &crate::world::Source| {
         json!({
-            "layer": layer_of(flow, scope), "node": source.node, "service": source.service, "instance": "", "scope": scope,
+            "layer": layer_of(flow, scope), "node": source.node, "service": source.service,
+            "instance": "", "scope": scope,
             "broker": null, "rate_hz": advertise.rate_hz, "max_bytes": advertise.max_bytes,
-            "priority": advertise.priority, "reliability": advertise.reliability, "durability": advertise.durability,
+            "priority": advertise.priority, "reliability": advertise.reliability,
+            "durability": advertise.durability,
             "expires_in_s": null, "local": false, "flow": flow,
         })
     };
     advertise.sources.iter().map(row).collect()
 }
 
-/// The layer of what a flow tells of a scope: what a gateway tells of flows outside is of any other, so empty.
+/// The layer of what a flow tells of a scope: what a gateway tells of flows outside is of any
+/// other, so empty.
 fn layer_of(flow: &blaze_domain::FlowId, scope: Scope) -> &str {
     if scope == Scope::Inter { "" } else { flow.layer.as_str() }
 }
 
 fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) -> Value {
     json!({
-        "layer": layer_of(flow, scope), "node": if scope == Scope::Node { flow.node.as_str() } else { "" }, "service": "",
+        "layer": layer_of(flow, scope),
+        "node": if scope == Scope::Node { flow.node.as_str() } else { "" }, "service": "",
         "instance": "", "scope": scope, "broker": null, "max_rate_hz": request.max_rate_hz,
         "lifespan_ms": request.lifespan_ms, "bare": request.bare, "priority": request.priority,
-        "reliability": request.reliability, "durability": request.durability, "expires_in_s": null, "local": false,
+        "reliability": request.reliability, "durability": request.durability, "expires_in_s": null,
+        "local": false,
         "flow": flow,
     })
 }
@@ -225,10 +234,7 @@ async fn bridges(State(shared): App) -> Json<Value> {
         .collect();
     let balance = balance(now, &control);
     drop(control);
-    answer(
-        &shared,
-        json!({"bridges": rows, "not_owner": not_owner, "balance": balance}),
-    )
+    answer(&shared, json!({"bridges": rows, "not_owner": not_owner, "balance": balance}))
 }
 
 /// How much this flow carries, and the topics that it gave to other flows of its layer.
@@ -242,16 +248,16 @@ fn balance(now: Instant, control: &ControlCore) -> Value {
     });
     json!({
         "out_bytes_per_s": load.out_bytes_per_s, "in_bytes_per_s": load.in_bytes_per_s,
-        "moves": {"load": moves.by_load, "settled": moves.settled, "taken_back": moves.taken_back}, "last_move": last,
+        "moves": {
+            "load": moves.by_load,
+            "settled": moves.settled,
+            "taken_back": moves.taken_back,
+        }, "last_move": last,
     })
 }
 
 fn scope_and_broker(shared: &Shared, scope: Scope) -> Value {
-    let broker = if scope == Scope::Inter {
-        json!("dds")
-    } else {
-        broker_of(shared, scope)
-    };
+    let broker = if scope == Scope::Inter { json!("dds") } else { broker_of(shared, scope) };
     json!({"scope": scope, "broker": broker})
 }
 
@@ -270,11 +276,7 @@ fn bridge_id(path: &TopicPath, bridge: &BridgeState, own_layer: &str) -> String 
                     && other.receiver().is_some_and(|(other_layer, _)| other_layer == layer)
             };
             let several = path.bridges.iter().filter(same_layer).count() > 1;
-            let node = if several {
-                format!("|{}", receiver.node)
-            } else {
-                String::new()
-            };
+            let node = if several { format!("|{}", receiver.node) } else { String::new() };
             format!("{topic}|{from}>inter|{layer}{node}")
         }
     }
@@ -289,7 +291,9 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
     let (to_scope, layer, flow) = match &bridge.target {
         Target::Node { .. } => (Scope::Node, shared.me.layer.to_string(), shared.me.to_string()),
         Target::Layer => (Scope::Layer, shared.me.layer.to_string(), shared.me.to_string()),
-        Target::Inter { layer, receiver } => (Scope::Inter, layer.to_string(), receiver.to_string()),
+        Target::Inter { layer, receiver } => {
+            (Scope::Inter, layer.to_string(), receiver.to_string())
+        }
     };
     let mut to = scope_and_broker(shared, to_scope);
     extend(&mut to, json!({"layer": layer, "flow": flow}));
@@ -305,14 +309,17 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
     };
     json!({
         "id": bridge_id(path, bridge, shared.me.layer.as_str()), "topic": path.name,
-        "from": scope_and_broker(shared, bridge.from), "to": to, "state": state, "since_s": rounded(since),
+        "from": scope_and_broker(shared, bridge.from), "to": to, "state": state,
+        "since_s": rounded(since),
         "in": {"messages": bridge.stats.taken.messages, "bytes": bridge.stats.taken.bytes},
         "out": {"messages": bridge.stats.out.messages, "bytes": bridge.stats.out.bytes},
         "load_bytes_per_s": bridge.load(), "queued": bridge.stats.queued(), "dropped": dropped,
         "latency_ms": {
-            "p50": bridge.stats.latency.quantile_ms(0.5), "p99": bridge.stats.latency.quantile_ms(0.99),
+            "p50": bridge.stats.latency.quantile_ms(0.5),
+            "p99": bridge.stats.latency.quantile_ms(0.99),
         },
-        "detail": bridge.failure, "class": class, "reliable": bridge.lane.reliable, "max_rate_hz": bridge.lane.max_rate_hz,
+        "detail": bridge.failure, "class": class, "reliable": bridge.lane.reliable,
+        "max_rate_hz": bridge.lane.max_rate_hz,
         "lifespan_ms": bridge.lane.lifespan_ms,
     })
 }

@@ -1,4 +1,5 @@
-//! The allocation of a running flow: what was measured goes to the limiter, and its rates to the lanes.
+//! The allocation of a running flow: what was measured goes to the limiter, and its rates to the
+//! lanes.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -14,8 +15,9 @@ use crate::limit::wire_factor::Totals;
 use crate::link::{Engine, LinkBudgets, LinkCapacity, PacketSize};
 
 impl Shared {
-    /// Works out the rates of lanes where something has changed that they depend on; to be called every few milliseconds. The work is
-    /// done outside of the lock of the message path, which is taken for reading what there is and for setting the rates.
+    /// Works out the rates of lanes where something has changed that they depend on; to be called
+    /// every few milliseconds. The work is done outside of the lock of the message path, which is
+    /// taken for reading what there is and for setting the rates.
     pub(super) fn allocate(&self, now: Instant) {
         let mut limiter = self.limiter.lock();
         if limiter.is_time_to_look(now) {
@@ -61,14 +63,13 @@ impl Shared {
         });
     }
 
-    /// Takes what the node file says now: the pacer follows at once, the rates of lanes in a moment.
+    /// Takes what the node file says now: the pacer follows at once, the rates of lanes in a
+    /// moment.
     pub(super) fn set_bandwidth(&self, now: Instant, bandwidth: &BandwidthSection) {
         self.egress.set_budget(bandwidth.limit_bytes_per_s());
         self.limiter.lock().set_bandwidth(bandwidth.clone());
-        let budgets = self
-            .inter
-            .as_ref()
-            .map(|inter| link_budgets(bandwidth, inter.wire().packets()));
+        let budgets =
+            self.inter.as_ref().map(|inter| link_budgets(bandwidth, inter.wire().packets()));
         self.plane.with(|state| {
             state.core.set_large_bytes(bandwidth.large_bytes.into());
             if let Some((engine, budgets)) = state.engine.as_mut().zip(budgets) {
@@ -104,7 +105,9 @@ fn rate_of(capacity: LinkCapacity) -> LinkRate {
     match (capacity.measured_bytes_per_s, capacity.state) {
         (Some(carries), _) => LinkRate::Carries(carries),
         (None, State::Unknown) => LinkRate::Free,
-        (None, State::SlowStart | State::Steady | State::BackingOff) => LinkRate::Passing(capacity.bytes_per_s),
+        (None, State::SlowStart | State::Steady | State::BackingOff) => {
+            LinkRate::Passing(capacity.bytes_per_s)
+        }
     }
 }
 

@@ -1,4 +1,5 @@
-//! The task that drives the control core: control channels and link news in, answers, plans and registry messages out.
+//! The task that drives the control core: control channels and link news in, answers, plans and
+//! registry messages out.
 
 use std::collections::HashMap;
 use std::pin::Pin;
@@ -7,8 +8,8 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Broker, BrokerError, BrokerKind, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions,
-    Subscription,
+    Broker, BrokerError, BrokerKind, Content, FlowSide, Publisher, PublisherOptions, Received,
+    SubscribeOptions, Subscription,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WriterId};
@@ -93,7 +94,8 @@ impl ControlTask {
         self.drain(tick).await;
     }
 
-    /// Takes in nothing more, but tells others how it goes on until the flow has nothing left to do.
+    /// Takes in nothing more, but tells others how it goes on until the flow has nothing left to
+    /// do.
     async fn drain(&mut self, mut tick: tokio::time::Interval) {
         self.shared.control.lock().start_draining(Instant::now(), wall_ms());
         loop {
@@ -116,7 +118,9 @@ impl ControlTask {
         let mut control = self.shared.control.lock();
         for received in batch.drain(..) {
             match received.content {
-                Content::Bare { payload, .. } => control.control(Instant::now(), wall_ms(), scope, &payload),
+                Content::Bare { payload, .. } => {
+                    control.control(Instant::now(), wall_ms(), scope, &payload)
+                }
                 // Control channels carry JSON as it is.
                 Content::Frame(_) | Content::Malformed { .. } => control.refused += 1,
             }
@@ -149,7 +153,8 @@ impl ControlTask {
                 }
             }
             control.tick(now, wall_ms());
-            if control.state() == FlowState::Ready && !std::mem::replace(&mut self.was_ready, true) {
+            if control.state() == FlowState::Ready && !std::mem::replace(&mut self.was_ready, true)
+            {
                 self.ready.notify_one();
             }
         }
@@ -191,7 +196,8 @@ impl ControlTask {
     }
 
     fn carry_out_all(&mut self, now: Instant) {
-        // Not locked meanwhile: what is carried out may have a consequence, which is carried out too.
+        // Not locked meanwhile: what is carried out may have a consequence, which is carried out
+        // too.
         loop {
             let output = self.shared.control.lock().poll();
             let Some(output) = output else { break };
@@ -217,12 +223,7 @@ impl ControlTask {
                     inter.want(join);
                 }
             }
-            Output::Plan {
-                topic,
-                plan,
-                info,
-                duty,
-            } => {
+            Output::Plan { topic, plan, info, duty } => {
                 let places = self.shared.routes.apply(&topic, &plan, *info, &duty);
                 if duty == Duty::GivesUp {
                     self.shared.control.lock().given_up(now, wall_ms(), &topic, places);
@@ -237,11 +238,7 @@ impl ControlTask {
                 plane.link(|engine| engine.set_layer_away(now, away));
             }
             Output::LayerScope { shared } => {
-                let said = if shared {
-                    self.shared.layer_scope
-                } else {
-                    (LayerScope::None, 0)
-                };
+                let said = if shared { self.shared.layer_scope } else { (LayerScope::None, 0) };
                 plane.link(|engine| engine.set_layer_scope(now, said.0, said.1));
             }
             Output::SaveLease(lease) => {
@@ -287,10 +284,7 @@ impl ControlTask {
 
     /// What the own brokers keep of a writer goes.
     fn forget_writer(&self, topic: &TopicName, writer: WriterId) {
-        for side in [Scope::Node, Scope::Layer]
-            .into_iter()
-            .filter_map(|scope| self.side(scope))
-        {
+        for side in [Scope::Node, Scope::Layer].into_iter().filter_map(|scope| self.side(scope)) {
             side.forget_writer(&topic.into(), writer);
         }
     }
@@ -299,7 +293,13 @@ impl ControlTask {
         self.shared.brokers.of(scope)?.flow_side()
     }
 
-    fn publish(&mut self, scope: Scope, channel: ChannelName, body: &Bytes, deadline: Option<Instant>) {
+    fn publish(
+        &mut self,
+        scope: Scope,
+        channel: ChannelName,
+        body: &Bytes,
+        deadline: Option<Instant>,
+    ) {
         let Some(broker) = self.shared.brokers.of(scope) else {
             return;
         };
@@ -324,8 +324,9 @@ impl ControlTask {
     }
 }
 
-/// How a reserved channel is written. What flows of a layer tell one another goes reliably where the broker is DDS: there a burst of
-/// best-effort samples may be lost, and asking for it again takes longer. On Kafka it is reliable as it is.
+/// How a reserved channel is written. What flows of a layer tell one another goes reliably where
+/// the broker is DDS: there a burst of best-effort samples may be lost, and asking for it again
+/// takes longer. On Kafka it is reliable as it is.
 fn options_of(kind: BrokerKind, channel: &ChannelName) -> PublisherOptions {
     PublisherOptions {
         reliable: kind == BrokerKind::Dds && peers_channel().as_ref() == Some(channel),
@@ -345,11 +346,7 @@ type Attempt = Pin<Box<dyn Future<Output = Result<Subscription, BrokerError>> + 
 
 impl ControlChannel {
     fn new(broker: Option<Arc<dyn Broker>>) -> Self {
-        Self {
-            broker,
-            subscription: None,
-            attempt: None,
-        }
+        Self { broker, subscription: None, attempt: None }
     }
 
     /// Whether it is subscribed, or there is none.
@@ -357,8 +354,9 @@ impl ControlChannel {
         self.broker.is_none() || self.subscription.is_some()
     }
 
-    /// Waits for payloads; returns also when it has just been subscribed. Without a broker it never returns. Cancelling it
-    /// loses nothing: an attempt to subscribe goes on with the next call, however long the broker takes.
+    /// Waits for payloads; returns also when it has just been subscribed. Without a broker it never
+    /// returns. Cancelling it loses nothing: an attempt to subscribe goes on with the next call,
+    /// however long the broker takes.
     async fn receive(&mut self, batch: &mut Vec<Received>) {
         let Some(broker) = &self.broker else {
             return std::future::pending().await;
@@ -369,9 +367,7 @@ impl ControlChannel {
             }
             self.subscription = None;
         }
-        let attempt = self
-            .attempt
-            .get_or_insert_with(|| Box::pin(subscribe(Arc::clone(broker))));
+        let attempt = self.attempt.get_or_insert_with(|| Box::pin(subscribe(Arc::clone(broker))));
         let subscribed = attempt.await;
         self.attempt = None;
         match subscribed {
@@ -380,7 +376,9 @@ impl ControlChannel {
                 self.broker = None;
                 std::future::pending::<()>().await;
             }
-            Err(error) => tracing::debug!(%error, "cannot subscribe to the control channel, trying on"),
+            Err(error) => {
+                tracing::debug!(%error, "cannot subscribe to the control channel, trying on")
+            }
         }
     }
 
@@ -390,12 +388,10 @@ impl ControlChannel {
     }
 }
 
-/// Subscribes to the control channel; a failure is told after a while, so that trying on does no harm.
+/// Subscribes to the control channel; a failure is told after a while, so that trying on does no
+/// harm.
 async fn subscribe(broker: Arc<dyn Broker>) -> Result<Subscription, BrokerError> {
-    let options = SubscribeOptions {
-        max_messages: MAX_WAITING,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { max_messages: MAX_WAITING, ..SubscribeOptions::default() };
     let subscribed = broker.subscribe(&ChannelName::control(), options).await;
     if subscribed.is_err() {
         tokio::time::sleep(RETRY).await;

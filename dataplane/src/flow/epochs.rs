@@ -42,13 +42,18 @@ impl Epochs {
 
     fn next(&self) -> io::Result<u64> {
         let given = match &self.state_dir {
-            Some(dir) => blaze_runtime::state::next_epoch(dir, self.me.layer.as_str(), self.me.node.as_str())?,
+            Some(dir) => blaze_runtime::state::next_epoch(
+                dir,
+                self.me.layer.as_str(),
+                self.me.node.as_str(),
+            )?,
             None => wall_ms(),
         };
         Ok(self.after_last(given))
     }
 
-    /// One for a rebuilt participant: a directory that cannot be written any more does not hold it up.
+    /// One for a rebuilt participant: a directory that cannot be written any more does not hold it
+    /// up.
     pub(super) fn renew(&self) -> u64 {
         self.next().unwrap_or_else(|error| {
             tracing::warn!(%error, "the epoch is not kept");
@@ -59,9 +64,8 @@ impl Epochs {
     /// The clock may have been set back.
     fn after_last(&self, given: u64) -> u64 {
         let newer = |last: u64| given.max(last + 1);
-        let before = self
-            .last
-            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |last| Some(newer(last)));
+        let before =
+            self.last.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |last| Some(newer(last)));
         newer(before.unwrap_or_else(|last| last))
     }
 }

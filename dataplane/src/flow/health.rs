@@ -84,18 +84,12 @@ pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: 
 
 /// What the transport says, and how many flows found no place among the peers.
 fn with_refused(shared: &Shared, detail: String) -> String {
-    let waiting = shared
-        .plane
-        .read(|state| state.engine.as_ref().map_or(0, Engine::waiting_peers));
+    let waiting = shared.plane.read(|state| state.engine.as_ref().map_or(0, Engine::waiting_peers));
     if waiting == 0 {
         return detail;
     }
     let refused = format!("{waiting} more flows are not reached: {MAX_PEERS} peers are the most");
-    if detail.is_empty() {
-        refused
-    } else {
-        format!("{detail}; {refused}")
-    }
+    if detail.is_empty() { refused } else { format!("{detail}; {refused}") }
 }
 
 /// Whether flows of other groups are reached, on the inter scope or over a gateway.
@@ -107,25 +101,25 @@ fn inter_check(shared: &Shared, inter: &InterScope, listened: bool) -> (CheckSta
     };
     let apart = !matches!(stage, Stage::Gateway | Stage::Leaving { .. });
     match inter.status().filter(|_| !apart) {
-        Some(status) if status.ready && listened => (CheckStatus::Ok, with_refused(shared, status.detail)),
-        Some(status) if status.ready => (CheckStatus::Failed, "listening for other flows".to_owned()),
+        Some(status) if status.ready && listened => {
+            (CheckStatus::Ok, with_refused(shared, status.detail))
+        }
+        Some(status) if status.ready => {
+            (CheckStatus::Failed, "listening for other flows".to_owned())
+        }
         Some(status) => (CheckStatus::Failed, status.detail),
-        None if state == FlowState::Starting && stage == Stage::Listening => (
-            CheckStatus::Failed,
-            "listening for flows on the layer broker".to_owned(),
-        ),
+        None if state == FlowState::Starting && stage == Stage::Listening => {
+            (CheckStatus::Failed, "listening for flows on the layer broker".to_owned())
+        }
         None if state == FlowState::Starting => {
             let trouble = inter.trouble();
-            let waits = if trouble.is_empty() {
-                "listening for other flows".to_owned()
-            } else {
-                trouble
-            };
+            let waits =
+                if trouble.is_empty() { "listening for other flows".to_owned() } else { trouble };
             (CheckStatus::Failed, waits)
         }
         None if gateways.is_empty() => {
-            let detail =
-                "no gateway of this group lives: of the flows that share the layer broker none is on the inter scope";
+            let detail = "no gateway of this group lives: of the flows that share the layer broker \
+                none is on the inter scope";
             (CheckStatus::Failed, detail.to_owned())
         }
         None => (CheckStatus::Ok, format!("over {}", gateways.join(", "))),

@@ -1,4 +1,5 @@
-//! The inter scope of a flow: its transport, which comes and goes while the flow runs, as gateways do.
+//! The inter scope of a flow: its transport, which comes and goes while the flow runs, as gateways
+//! do.
 //!
 //! ```text
 //! control core ─► want ─► thread `inter`: start, or let out, say good-bye and stop ─► News ─► control core
@@ -82,7 +83,12 @@ impl Health {
 
 impl InterScope {
     /// An inter scope that is not joined.
-    pub(super) fn new(settings: InterSettings, me: FlowId, epochs: Epochs, plane: Arc<Plane>) -> Self {
+    pub(super) fn new(
+        settings: InterSettings,
+        me: FlowId,
+        epochs: Epochs,
+        plane: Arc<Plane>,
+    ) -> Self {
         Self {
             settings,
             me,
@@ -109,7 +115,8 @@ impl InterScope {
             // Nothing has been on the inter scope under it.
             self.epochs.first()
         };
-        let (settings, sink, epochs) = (&self.settings, Arc::clone(&self.plane), self.epochs.clone());
+        let (settings, sink, epochs) =
+            (&self.settings, Arc::clone(&self.plane), self.epochs.clone());
         let transport = DdsTransport::start(DdsConfig {
             domain: settings.domain,
             listen: settings.listen.into(),
@@ -117,10 +124,7 @@ impl InterScope {
             peer_slots: settings.peer_slots,
             mtu: settings.mtu.into(),
             chunking: settings.chunking,
-            local: Endpoint {
-                flow: self.me.clone(),
-                epoch,
-            },
+            local: Endpoint { flow: self.me.clone(), epoch },
             next_epoch: Arc::new(move || epochs.renew()),
             sink: Arc::new(move |event| sink.transport_event(event)),
         })
@@ -148,10 +152,7 @@ impl InterScope {
     /// The thread: joins and leaves as is wanted, until it is stopped.
     pub(super) fn run(&self) {
         // Who is on it from the start counts on it.
-        let mut health = Health {
-            works: self.is_joined(),
-            ..Health::default()
-        };
+        let mut health = Health { works: self.is_joined(), ..Health::default() };
         let mut pause = None;
         while let Some(join) = self.next(pause.take(), &mut health) {
             health = Health::default();
@@ -170,7 +171,8 @@ impl InterScope {
         }
     }
 
-    /// Waits for something to do: to join, or to leave. `None`: nothing any more. Meanwhile it is watched whether it works.
+    /// Waits for something to do: to join, or to leave. `None`: nothing any more. Meanwhile it is
+    /// watched whether it works.
     fn next(&self, pause: Option<Duration>, health: &mut Health) -> Option<bool> {
         let mut wish = self.wish.lock();
         if let Some(pause) = pause {
@@ -199,7 +201,8 @@ impl InterScope {
         }
         self.plane.say_goodbye();
         std::thread::sleep(GOODBYE);
-        // The pacer may still hold it for the datagram that it sends. Its end takes a while, in which nobody is to wait for it.
+        // The pacer may still hold it for the datagram that it sends. Its end takes a while, in
+        // which nobody is to wait for it.
         let gone = self.transport.lock().take();
         drop(gone);
         self.plane.drop_peers();
@@ -224,8 +227,8 @@ impl InterScope {
         self.trouble.lock().clone()
     }
 
-    /// Makes and drops writers as peers come and go. Of a peer that is down the control writer stays: it carries Hello
-    /// until the peer is forgotten, says Goodbye or begins a new life.
+    /// Makes and drops writers as peers come and go. Of a peer that is down the control writer
+    /// stays: it carries Hello until the peer is forgotten, says Goodbye or begins a new life.
     pub(super) fn follow(&self, news: &News) {
         let Some(transport) = self.current() else { return };
         let event = match news {
@@ -234,14 +237,19 @@ impl InterScope {
             News::Rebuilt(_) | News::Joined | News::Lost | News::Left => return,
         };
         match event {
-            LinkEvent::PeerUp(endpoint) | LinkEvent::PeerAdmitted(endpoint) => transport.connect(endpoint),
-            LinkEvent::PeerRefused { flow, peers } => {
-                tracing::warn!(%flow, peers, "no place for another flow among the peers on the inter scope");
+            LinkEvent::PeerUp(endpoint) | LinkEvent::PeerAdmitted(endpoint) => {
+                transport.connect(endpoint)
             }
-            LinkEvent::PeerDown {
-                endpoint,
-                reason: DownReason::Silent,
-            } => transport.disconnect(endpoint, &[Priority::State, Priority::Bulk]),
+            LinkEvent::PeerRefused { flow, peers } => {
+                tracing::warn!(
+                    %flow,
+                    peers,
+                    "no place for another flow among the peers on the inter scope",
+                );
+            }
+            LinkEvent::PeerDown { endpoint, reason: DownReason::Silent } => {
+                transport.disconnect(endpoint, &[Priority::State, Priority::Bulk])
+            }
             LinkEvent::PeerDown { endpoint, .. }
             | LinkEvent::PeerForgotten(endpoint)
             | LinkEvent::PeerRemoved(endpoint) => transport.disconnect(endpoint, Priority::ALL),
@@ -257,8 +265,7 @@ impl InterScope {
 
     /// Sends one datagram while there is a transport; before and after it nothing is sent.
     pub(super) fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
-        self.current()
-            .map_or(SendOutcome::NotSent, |transport| transport.send(to, class, datagram))
+        self.current().map_or(SendOutcome::NotSent, |transport| transport.send(to, class, datagram))
     }
 }
 
@@ -270,11 +277,16 @@ mod tests {
     fn it_works_when_it_is_ready_and_is_lost_after_a_while() {
         let start = Instant::now();
         let mut health = Health::default();
-        let mut look = |ms: u64, is_ready: bool| health.look(start + Duration::from_millis(ms), is_ready);
+        let mut look =
+            |ms: u64, is_ready: bool| health.look(start + Duration::from_millis(ms), is_ready);
         assert!(look(0, false).is_none() && look(10_000, false).is_none());
         assert!(matches!(look(10_100, true), Some(News::Joined)));
         // Built anew.
-        assert!(look(10_200, false).is_none() && look(12_000, false).is_none() && look(12_100, true).is_none());
+        assert!(
+            look(10_200, false).is_none()
+                && look(12_000, false).is_none()
+                && look(12_100, true).is_none()
+        );
         assert!(look(13_000, false).is_none() && look(17_900, false).is_none());
         assert!(matches!(look(18_000, false), Some(News::Lost)));
         assert!(look(30_000, false).is_none());

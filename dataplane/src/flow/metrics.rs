@@ -1,4 +1,5 @@
-//! `/metrics`: the counters of the flow in Prometheus' words. Made anew for each scrape from the state under its lock.
+//! `/metrics`: the counters of the flow in Prometheus' words. Made anew for each scrape from the
+//! state under its lock.
 
 mod latency;
 
@@ -72,10 +73,7 @@ enum Metric {
 
 impl Page {
     fn new() -> prometheus::Result<Self> {
-        let mut page = Self {
-            registry: Registry::new(),
-            metrics: BTreeMap::new(),
-        };
+        let mut page = Self { registry: Registry::new(), metrics: BTreeMap::new() };
         for line in METRICS.lines() {
             let mut words = line.splitn(4, ' ');
             let mut word = || words.next().unwrap_or_default();
@@ -98,10 +96,12 @@ impl Page {
     /// Adds to the value of one set of labels.
     fn add(&self, name: &str, labels: &[&str], value: f64) {
         let added = match self.metrics.get(name) {
-            Some(Metric::Counter(counter)) => counter
-                .get_metric_with_label_values(labels)
-                .map(|counter| counter.inc_by(value)),
-            Some(Metric::Gauge(gauge)) => gauge.get_metric_with_label_values(labels).map(|gauge| gauge.add(value)),
+            Some(Metric::Counter(counter)) => {
+                counter.get_metric_with_label_values(labels).map(|counter| counter.inc_by(value))
+            }
+            Some(Metric::Gauge(gauge)) => {
+                gauge.get_metric_with_label_values(labels).map(|gauge| gauge.add(value))
+            }
             None => Err(prometheus::Error::Msg("it is not in the table".to_owned())),
         };
         debug_assert!(added.is_ok(), "{name} {labels:?}: {added:?}");
@@ -138,17 +138,16 @@ impl Page {
                 self.add("blaze_flow_dropped_total", &["", "", reason.as_str()], count as f64);
             }
             for (id, path) in state.core.topics_mut() {
-                let topic = if id.0 < MAX_TOPICS {
-                    path.name.to_string()
-                } else {
-                    OTHER.to_owned()
-                };
+                let topic =
+                    if id.0 < MAX_TOPICS { path.name.to_string() } else { OTHER.to_owned() };
                 self.fill_topic(now, (&topic, id), path, &sources, &mut histograms);
             }
         });
         let mut text = String::new();
         if !histograms.is_empty() {
-            text.push_str("# HELP blaze_flow_bridge_latency_seconds Time of a message in this flow.\n");
+            text.push_str(
+                "# HELP blaze_flow_bridge_latency_seconds Time of a message in this flow.\n",
+            );
             text.push_str("# TYPE blaze_flow_bridge_latency_seconds histogram\n");
         }
         for ((topic, to), histogram) in histograms {
@@ -204,13 +203,12 @@ impl Page {
             for (reason, count) in stats.dropped.iter() {
                 self.add("blaze_flow_dropped_total", &[topic, &to, reason.as_str()], count as f64);
             }
-            histograms
-                .entry((topic.to_owned(), to.clone()))
-                .or_default()
-                .add(bridge);
+            histograms.entry((topic.to_owned(), to.clone())).or_default().add(bridge);
             let source = sources.get(&(id, bridge.from));
             let state = match (bridge.phase, source) {
-                (Phase::Failed { .. }, _) | (Phase::Up { .. }, Some(SourceState::Failed(_))) => "failed",
+                (Phase::Failed { .. }, _) | (Phase::Up { .. }, Some(SourceState::Failed(_))) => {
+                    "failed"
+                }
                 (Phase::Up { .. }, Some(SourceState::Subscribed)) => "up",
                 (Phase::Up { .. }, _) if bridge.from == Scope::Inter => "up",
                 (Phase::Up { .. }, _) => "starting",
@@ -218,11 +216,14 @@ impl Page {
                 (Phase::Ended, _) => continue,
             };
             self.add("blaze_flow_bridges", &[state], 1.0);
-            let rate = |kind: &str, hz: f64| self.add("blaze_flow_rate_hertz", &[topic, &to, kind], hz);
+            let rate =
+                |kind: &str, hz: f64| self.add("blaze_flow_rate_hertz", &[topic, &to, kind], hz);
             rate("actual", bridge.out_rate.rate(now).0);
             // What goes to one flow is one lane, on whatever scope it was published.
             let counts = match bridge.receiver() {
-                Some((_, receiver)) => matches!(bridge.phase, Phase::Up { .. }) && !receivers.contains(receiver),
+                Some((_, receiver)) => {
+                    matches!(bridge.phase, Phase::Up { .. }) && !receivers.contains(receiver)
+                }
                 // Nor does it count twice what several bridges write to one broker.
                 None => bridge.from != Scope::Inter && !local.contains(&to),
             };
@@ -242,9 +243,8 @@ impl Page {
     fn fill_link(&self, shared: &Shared) {
         let now = Instant::now();
         let said = |engine: &Engine| (engine.peers(), engine.counters());
-        let (peers, counters) = shared
-            .plane
-            .read(|state| state.engine.as_ref().map(said).unwrap_or_default());
+        let (peers, counters) =
+            shared.plane.read(|state| state.engine.as_ref().map(said).unwrap_or_default());
         for peer in &peers {
             let name = peer.flow.to_string();
             let up = f64::from(u8::from(peer.state == PeerState::Up));
@@ -283,8 +283,9 @@ impl Page {
     }
 
     fn fill_budgets(&self, now: Instant, shared: &Shared) {
-        let budget =
-            |to: &str, kind: &str, bytes: f64| self.add("blaze_flow_budget_bytes_per_second", &[to, kind], bytes);
+        let budget = |to: &str, kind: &str, bytes: f64| {
+            self.add("blaze_flow_budget_bytes_per_second", &[to, kind], bytes)
+        };
         let mut used = 0.0;
         for (layer, mut traffic) in shared.egress.traffic().by_layer {
             let to = format!("inter/{layer}");
@@ -336,10 +337,7 @@ impl Page {
             self.add("blaze_flow_compression_pool", &[state], value as f64);
         }
         self.add("blaze_flow_compression_pool_seconds", &[], pool.busy.as_secs_f64());
-        self.count(&[
-            ("compression_refused", press.refused),
-            ("compression_failed", press.failed),
-        ]);
+        self.count(&[("compression_refused", press.refused), ("compression_failed", press.failed)]);
     }
 
     fn fill_control(&self, shared: &Shared) {
@@ -360,7 +358,8 @@ impl Page {
             ("kept_lease_skipped", control.skipped_leases),
         ]);
         let (load, moves) = (control.load(), control.moves());
-        for (direction, bytes_per_s) in [("out", load.out_bytes_per_s), ("in", load.in_bytes_per_s)] {
+        for (direction, bytes_per_s) in [("out", load.out_bytes_per_s), ("in", load.in_bytes_per_s)]
+        {
             self.add("blaze_flow_load_bytes_per_second", &[direction], bytes_per_s as f64);
         }
         for (reason, count) in [
@@ -391,7 +390,8 @@ mod tests {
     fn the_table_has_what_is_written_and_the_page_of_the_documentation_has_the_table() {
         let page = Page::new().unwrap();
         for name in include_str!("metrics.rs").split('"').filter(|text| {
-            text.starts_with("blaze_flow_") && text.chars().all(|letter| letter.is_ascii_lowercase() || letter == '_')
+            text.starts_with("blaze_flow_")
+                && text.chars().all(|letter| letter.is_ascii_lowercase() || letter == '_')
         }) {
             assert!(name == "blaze_flow_" || page.metrics.contains_key(name), "{name}");
         }

@@ -1,4 +1,5 @@
-//! One BlazeFlow process, or one of several in a process: tasks, threads, brokers and the link around the pure cores.
+//! One BlazeFlow process, or one of several in a process: tasks, threads, brokers and the link
+//! around the pure cores.
 //!
 //! | who | what | how many |
 //! |---|---|---|
@@ -115,7 +116,8 @@ impl Shared {
         self.hears[usize::from(scope == Scope::Layer)].load(Ordering::Relaxed)
     }
 
-    /// Tells the link what its Hellos say of this flow's traffic, and the wall clock, which may have been set.
+    /// Tells the link what its Hellos say of this flow's traffic, and the wall clock, which may
+    /// have been set.
     fn tell_link(&self) {
         let now = Instant::now();
         let limit = self.egress.budget() as u64;
@@ -159,21 +161,20 @@ pub struct Beginning {
     pub layer_prefix: String,
 }
 
-/// Starts a flow whose brokers need to know nothing of it, as those within a process. It returns as soon as the admin port
-/// listens; [`RunningFlow::ready`] waits for the rest.
+/// Starts a flow whose brokers need to know nothing of it, as those within a process. It returns as
+/// soon as the admin port listens; [`RunningFlow::ready`] waits for the rest.
 ///
 /// # Errors
 /// As [`start_with`], and when the epoch cannot be kept.
 pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Result<RunningFlow> {
-    let epochs = Epochs::begin(&options.settings.me, options.state_dir.as_deref()).context("keeping the epoch")?;
-    let beginning = Beginning {
-        epochs,
-        layer_prefix: String::new(),
-    };
+    let epochs = Epochs::begin(&options.settings.me, options.state_dir.as_deref())
+        .context("keeping the epoch")?;
+    let beginning = Beginning { epochs, layer_prefix: String::new() };
     start_with(options, beginning, supervisor).await
 }
 
-/// Starts a flow whose brokers were opened for the life that has begun; its `state_dir` was used for that already.
+/// Starts a flow whose brokers were opened for the life that has begun; its `state_dir` was used
+/// for that already.
 ///
 /// # Errors
 /// When the admin port cannot be bound or the inter scope's configuration can never work.
@@ -182,9 +183,7 @@ pub async fn start_with(
     beginning: Beginning,
     supervisor: Supervisor,
 ) -> anyhow::Result<RunningFlow> {
-    let FlowOptions {
-        settings, node, layer, ..
-    } = options;
+    let FlowOptions { settings, node, layer, .. } = options;
     let Beginning { epochs, layer_prefix } = beginning;
     let epoch = epochs.first();
     let now = Instant::now();
@@ -210,10 +209,7 @@ pub async fn start_with(
         Engine::new(config, now, wall_ns())
     });
     let plane = Plane::new(core, engine);
-    let brokers = LocalBrokers {
-        node,
-        layer: layer.map(|layer| layer.broker),
-    };
+    let brokers = LocalBrokers { node, layer: layer.map(|layer| layer.broker) };
     let config = ControlConfig {
         me: settings.me.clone(),
         kind: settings.kind,
@@ -221,15 +217,14 @@ pub async fn start_with(
         node_scope: brokers.node.is_some(),
         layer_scope,
         // Within a process flows hear each other over the link alone.
-        replicas: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)).then_some(said_layer_scope.0),
+        replicas: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds))
+            .then_some(said_layer_scope.0),
         gateway: settings.gateway,
         inter_scope: settings.inter.is_some(),
         // Channels there are set up beforehand, so all answers share one.
         layer_answers_need_id: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)),
         layer_names: match layer_kind {
-            Some(BrokerKind::Kafka) => LayerNames::Kafka {
-                prefix_bytes: layer_prefix.len(),
-            },
+            Some(BrokerKind::Kafka) => LayerNames::Kafka { prefix_bytes: layer_prefix.len() },
             _ => LayerNames::Any,
         },
         lease_stores: brokers.lease_stores(),
@@ -264,9 +259,7 @@ pub async fn start_with(
 
     let live = shared.live.lock().clone();
     shared.set_bandwidth(now, &live.bandwidth);
-    shared
-        .plane
-        .read(|state| state.core.set_compression(live.compression.clone()));
+    shared.plane.read(|state| state.core.set_compression(live.compression.clone()));
     if shared.inter.is_some() {
         start_pool(&shared.plane, live.pool_threads, &supervisor)?;
     }
@@ -302,14 +295,7 @@ pub async fn start_with(
         true => Some(start_inter(&shared, &supervisor)?),
         false => None,
     };
-    Ok(RunningFlow {
-        shared,
-        supervisor,
-        admin: address,
-        leave,
-        pacer,
-        control,
-    })
+    Ok(RunningFlow { shared, supervisor, admin: address, leave, pacer, control })
 }
 
 impl RunningFlow {
@@ -340,9 +326,7 @@ impl RunningFlow {
     pub fn reload(&self, live: LiveSettings) {
         let now = Instant::now();
         self.shared.set_bandwidth(now, &live.bandwidth);
-        self.shared
-            .plane
-            .read(|state| state.core.set_compression(live.compression.clone()));
+        self.shared.plane.read(|state| state.core.set_compression(live.compression.clone()));
         if let Some(pool) = self.shared.plane.codec()
             && let Err(error) = pool.resize(pool::threads(live.pool_threads))
         {
@@ -363,12 +347,14 @@ impl RunningFlow {
         shared.plane.with(|state| state.core.leave(Instant::now()));
         self.leave.draining.cancel();
         let until = Instant::now() + DRAIN;
-        // Nothing is planned any more, and whoever comes next knows where to begin: only then are the bridges draining.
+        // Nothing is planned any more, and whoever comes next knows where to begin: only then are
+        // the bridges draining.
         let _ = tokio::time::timeout(DRAIN, self.leave.handed_over.cancelled()).await;
         while Instant::now() < until && shared.plane.is_draining() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
-        // With the good-bye others take the topics over: what they write must not be overtaken by what still waits for a broker here.
+        // With the good-bye others take the topics over: what they write must not be overtaken by
+        // what still waits for a broker here.
         while Instant::now() < until + CLOSE && shared.plane.has_unwritten() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
@@ -386,7 +372,10 @@ impl RunningFlow {
         let closed_by = tokio::time::Instant::now() + CLOSE;
         for broker in brokers.into_iter().flatten() {
             if tokio::time::timeout_at(closed_by, broker.close()).await.is_err() {
-                tracing::warn!(broker = %broker.kind(), "the broker did not take everything in time");
+                tracing::warn!(
+                    broker = %broker.kind(),
+                    "the broker did not take everything in time",
+                );
             }
         }
         shared.egress.stop();
@@ -404,7 +393,8 @@ impl RunningFlow {
     }
 }
 
-/// Starts the threads that compress. They end when the flow has drained, or with the process if it does not.
+/// Starts the threads that compress. They end when the flow has drained, or with the process if it
+/// does not.
 fn start_pool(plane: &Arc<Plane>, threads: u16, supervisor: &Supervisor) -> anyhow::Result<()> {
     let of_threads = supervisor.clone();
     let spawner: Spawner = Box::new(move |name, run| {
@@ -448,7 +438,8 @@ fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, epoch: u64) {
         let Some(broker) = shared.brokers.of(scope) else {
             continue;
         };
-        let shares = scope == Scope::Layer && matches!(broker.kind(), BrokerKind::Kafka | BrokerKind::Dds);
+        let shares =
+            scope == Scope::Layer && matches!(broker.kind(), BrokerKind::Kafka | BrokerKind::Dds);
         let (tell, listened) = watch::channel(true);
         if let (true, Some(channel)) = (shares, peers_channel()) {
             let side = broker.flow_side();
@@ -476,8 +467,8 @@ fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, epoch: u64) {
     }
 }
 
-/// What Hello says of the layer broker. One that only this process sees is none to others, and has an identity all the
-/// same: flows of this process share it.
+/// What Hello says of the layer broker. One that only this process sees is none to others, and has
+/// an identity all the same: flows of this process share it.
 fn said_layer_scope(layer: Option<&LayerBroker>) -> (LayerScope, u64) {
     let Some(layer) = layer else {
         return (LayerScope::None, 0);

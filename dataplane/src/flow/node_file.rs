@@ -5,7 +5,8 @@ use std::sync::Arc;
 use blaze_brokers::{OpenError, check_layer};
 use blaze_domain::node_file::{Fault, NodeFile};
 use blaze_runtime::config::{
-    Follower, Keys, Loaded, LocatedFault, Schema, Sources, Verdict, WatchSettings, follow, load_typed, watch_with,
+    Follower, Keys, Loaded, LocatedFault, Schema, Sources, Verdict, WatchSettings, follow,
+    load_typed, watch_with,
 };
 use blaze_runtime::logs::{self, LogHandle};
 use blaze_runtime::{Supervisor, TaskPolicy};
@@ -59,23 +60,20 @@ pub fn schema() -> Schema<NodeFile> {
     })
 }
 
-/// What the adapter has against the section of the layer scope. What was not built in is told beside that.
+/// What the adapter has against the section of the layer scope. What was not built in is told
+/// beside that.
 fn broker_fault(file: &NodeFile) -> Option<Fault> {
     match check_layer(file.brokers.layer.as_ref()?) {
-        Err(OpenError::Setting { key, reason }) => Some(Fault {
-            path: format!("brokers.layer.{key}"),
-            detail: reason,
-        }),
+        Err(OpenError::Setting { key, reason }) => {
+            Some(Fault { path: format!("brokers.layer.{key}"), detail: reason })
+        }
         Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
     }
 }
 
 fn level_fault(file: &NodeFile) -> Option<Fault> {
     let detail = logs::check_level(&file.log.level).err()?;
-    Some(Fault {
-        path: "log.level".to_owned(),
-        detail,
-    })
+    Some(Fault { path: "log.level".to_owned(), detail })
 }
 
 /// Whether a file differs from the one of the start in what a flow reads then alone.
@@ -116,7 +114,11 @@ impl Followed {
     ///
     /// # Errors
     /// Every fault; they are told with `name` as that of a file.
-    pub fn of_tree(name: &str, tree: &Value, log: Option<LogHandle>) -> Result<Self, Vec<LocatedFault>> {
+    pub fn of_tree(
+        name: &str,
+        tree: &Value,
+        log: Option<LogHandle>,
+    ) -> Result<Self, Vec<LocatedFault>> {
         let sources = Sources::of_text(name, &tree.to_string());
         Ok(Self {
             loaded: load_typed(&sources, &schema())?,
@@ -127,9 +129,10 @@ impl Followed {
     }
 }
 
-/// Takes over what may change while the flow runs, as long as the supervisor does: what the node file says, and over it what
-/// BlazeConfig says where the flow is a service. What is faulty changes nothing and shows on `/readyz`; what BlazeConfig said is
-/// acknowledged, and `judged` hears what became of it.
+/// Takes over what may change while the flow runs, as long as the supervisor does: what the node
+/// file says, and over it what BlazeConfig says where the flow is a service. What is faulty changes
+/// nothing and shows on `/readyz`; what BlazeConfig said is acknowledged, and `judged` hears what
+/// became of it.
 pub fn follow_node_file(
     flow: &Arc<RunningFlow>,
     followed: Followed,
@@ -137,12 +140,7 @@ pub fn follow_node_file(
     supervisor: &Supervisor,
     mut judged: impl FnMut(&Verdict) + Send + 'static,
 ) {
-    let Followed {
-        sources,
-        loaded,
-        watch,
-        log,
-    } = followed;
+    let Followed { sources, loaded, watch, log } = followed;
     let program = service.map(|service| service.program().clone());
     let overlays = match &program {
         Some(program) => program.overlays(),
@@ -182,11 +180,12 @@ mod tests {
 
     fn tree(rest: Value) -> Value {
         let mut tree = json!({
-            "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "a"}, "brokers": {"layer": {"memory": {}}}
+            "layer": {
+                "name": "edge",
+                "kind": "edge",
+            }, "node": {"name": "a"}, "brokers": {"layer": {"memory": {}}}
         });
-        let Value::Object(rest) = rest else {
-            unreachable!("an object")
-        };
+        let Value::Object(rest) = rest else { unreachable!("an object") };
         tree.as_object_mut().unwrap().extend(rest);
         tree
     }
@@ -199,11 +198,16 @@ mod tests {
     fn only_what_changes_while_it_runs_needs_no_restart() {
         let started = file(json!({}));
         let live = json!({
-            "flow": {"bandwidth": {"limit_mbps": 7}, "compression": {"level": 1}, "pool_threads": 1}, "log": {"level": "debug"},
+            "flow": {
+                "bandwidth": {"limit_mbps": 7},
+                "compression": {"level": 1},
+                "pool_threads": 1,
+            }, "log": {"level": "debug"},
         });
         assert!(!needs_restart(&started, &file(live)));
         let of_others = json!({
-            "admin": {"worker": "127.0.0.1:9999"}, "worker": {"lease_ms": 1000}, "config": {"server": "https://10.0.0.1:50051"},
+            "admin": {"worker": "127.0.0.1:9999"}, "worker": {"lease_ms": 1000},
+            "config": {"server": "https://10.0.0.1:50051"},
             "database": {"embedded": {"path": "worker.db"}}, "monitor": {"ping_period_s": 5},
         });
         assert!(!needs_restart(&started, &file(of_others)));

@@ -17,7 +17,8 @@ use crate::link::transport::SendOutcome;
 
 /// The pacer wakes at least that often, to notice a new limit or the end.
 const IDLE: Duration = Duration::from_millis(100);
-/// A debt from which on LinkControl is let out all the same; shorter ones delay it by no more than this.
+/// A debt from which on LinkControl is let out all the same; shorter ones delay it by no more than
+/// this.
 const LONG_DEBT: Duration = Duration::from_millis(10);
 
 /// What the pacer shares with admin and metrics.
@@ -98,7 +99,8 @@ impl Egress {
                 pacer.set_limit(budget, now);
             }
             let wait = pacer.wait(now);
-            // Data waits off a debt. LinkControl does not, where that is long: peers would think this flow dead.
+            // Data waits off a debt. LinkControl does not, where that is long: peers would think
+            // this flow dead.
             let transmit = if wait.is_zero() {
                 match plane.next_transmit(IDLE) {
                     Next::Datagram(transmit) => Some(transmit),
@@ -136,7 +138,14 @@ impl Egress {
 }
 
 impl Traffic {
-    fn add(&mut self, now: Instant, to: &LayerName, class: Priority, wire_bytes: u64, control: bool) {
+    fn add(
+        &mut self,
+        now: Instant,
+        to: &LayerName,
+        class: Priority,
+        wire_bytes: u64,
+        control: bool,
+    ) {
         let control_bytes = if control { wire_bytes } else { 0 };
         self.wire_bytes += wire_bytes;
         self.control_bytes += control_bytes;
@@ -156,11 +165,7 @@ impl Traffic {
 
 impl LayerTraffic {
     fn new(now: Instant) -> Self {
-        Self {
-            wire_bytes: [0; 3],
-            control_bytes: 0,
-            rate: RateMeter::new(now),
-        }
+        Self { wire_bytes: [0; 3], control_bytes: 0, rate: RateMeter::new(now) }
     }
 }
 

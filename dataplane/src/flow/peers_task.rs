@@ -1,13 +1,13 @@
-//! Flows that share a layer broker hear one another there. Of a Kafka broker those of one layer share its topics, and two
-//! layers never use one; on DDS frames of another layer are told apart.
+//! Flows that share a layer broker hear one another there. Of a Kafka broker those of one layer
+//! share its topics, and two layers never use one; on DDS frames of another layer are told apart.
 //!
 //! ```text
 //! control core: Hello, Delta, … ─► blaze/flow/peers ─┬─► Hellos of other layers ─► Claims ─► stand back, or not (Kafka)
 //!                                                    └─► what the own layer says ─► control core
 //! ```
 //!
-//! Of two layers with one broker and one prefix the one whose flow began first has it; the other's flows bridge nothing there
-//! until they have not heard of it for 2.5 s.
+//! Of two layers with one broker and one prefix the one whose flow began first has it; the other's
+//! flows bridge nothing there until they have not heard of it for 2.5 s.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -42,11 +42,7 @@ pub(super) struct Claims {
 
 impl Claims {
     pub(super) fn new(me: FlowId, epoch: u64) -> Self {
-        Self {
-            me,
-            epoch,
-            others: BTreeMap::new(),
-        }
+        Self { me, epoch, others: BTreeMap::new() }
     }
 
     /// Takes what came on the channel.
@@ -77,8 +73,7 @@ impl Claims {
 
     /// The flow of another layer that was first, if there is one that lives.
     pub(super) fn first(&mut self, now: Instant) -> Option<&FlowId> {
-        self.others
-            .retain(|_, (_, heard)| now.saturating_duration_since(*heard) < LIVE);
+        self.others.retain(|_, (_, heard)| now.saturating_duration_since(*heard) < LIVE);
         let own = (self.epoch, &self.me);
         let others = self.others.iter().map(|(flow, (epoch, _))| (*epoch, flow));
         others.filter(|other| *other < own).min().map(|(_, flow)| flow)
@@ -112,11 +107,8 @@ impl PeersTask {
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             if subscription.is_none() {
-                subscription = self
-                    .broker
-                    .subscribe(&self.channel, SubscribeOptions::default())
-                    .await
-                    .ok();
+                subscription =
+                    self.broker.subscribe(&self.channel, SubscribeOptions::default()).await.ok();
                 since = Instant::now();
                 if subscription.is_some() {
                     self.shared.control.lock().hears_replicas(since);
@@ -136,7 +128,10 @@ impl PeersTask {
             {
                 standing_back = first.is_some();
                 if let Some(first) = first {
-                    tracing::warn!(%first, "another layer's flow uses this Kafka: give each layer a prefix");
+                    tracing::warn!(
+                        %first,
+                        "another layer's flow uses this Kafka: give each layer a prefix",
+                    );
                 } else {
                     tracing::info!("the Kafka of this layer is free again");
                 }
@@ -193,7 +188,8 @@ fn read(batch: &mut Vec<Received>) -> Vec<Message> {
     batch.drain(..).filter_map(read).collect()
 }
 
-/// Tells the control core. Whether it is to work at once: a sign of life alone changes nothing, and comes a thousand times a second.
+/// Tells the control core. Whether it is to work at once: a sign of life alone changes nothing, and
+/// comes a thousand times a second.
 fn take(control: &mut ControlCore, now: Instant, away: bool, messages: Vec<Message>) -> bool {
     if away {
         control.excuse_replicas(now);
@@ -221,12 +217,8 @@ mod tests {
 
     fn hello(flow: &str, epoch: u64) -> LinkControl {
         let (layer, node) = flow.split_once('/').unwrap();
-        let hello = Hello {
-            layer: layer.to_owned(),
-            node: node.to_owned(),
-            epoch,
-            ..Hello::default()
-        };
+        let hello =
+            Hello { layer: layer.to_owned(), node: node.to_owned(), epoch, ..Hello::default() };
         LinkControl::from(Body::Hello(hello))
     }
 
@@ -252,11 +244,7 @@ mod tests {
             "of equal epochs the smaller name"
         );
         assert_eq!(first_of(&[("fog/a", 10)]), None);
-        assert_eq!(
-            first_of(&[("cloud/a", 1), ("cloud/b", 2)]),
-            None,
-            "the own layer shares it"
-        );
+        assert_eq!(first_of(&[("cloud/a", 1), ("cloud/b", 2)]), None, "the own layer shares it");
     }
 
     #[test]
@@ -269,10 +257,7 @@ mod tests {
         assert!(claims.first(now + Duration::from_millis(4998)).is_some());
         assert!(claims.first(now + Duration::from_millis(4999)).is_none());
         claims.hear(now + Duration::from_secs(6), &hello("fog/a", 12));
-        assert!(
-            claims.first(now + Duration::from_secs(6)).is_none(),
-            "it began anew, after us"
-        );
+        assert!(claims.first(now + Duration::from_secs(6)).is_none(), "it began anew, after us");
     }
 
     #[test]

@@ -1,8 +1,9 @@
 //! The message path and the link of one flow behind one lock.
 //!
-//! Source tasks, the transport's reader threads and the pacer take the lock once per batch or datagram and never while
-//! they wait. What the link has to say to the control core is put into a bounded inbox. A thread of the compression pool
-//! takes it twice in each of its turns, to see what is to be done and to say what came of it, and not in between.
+//! Source tasks, the transport's reader threads and the pacer take the lock once per batch or
+//! datagram and never while they wait. What the link has to say to the control core is put into a
+//! bounded inbox. A thread of the compression pool takes it twice in each of its turns, to see what
+//! is to be done and to say what came of it, and not in between.
 
 use std::collections::VecDeque;
 use std::io;
@@ -27,8 +28,8 @@ use crate::link::{Engine, LinkEvent, Transmit};
 #[cfg(test)]
 mod tests;
 
-/// Link events that wait for the control core; Hellos and registry messages beyond it are dropped and repaired by the
-/// next digest.
+/// Link events that wait for the control core; Hellos and registry messages beyond it are dropped
+/// and repaired by the next digest.
 const MAX_NEWS: usize = 10_000;
 
 /// What the control task is told.
@@ -82,7 +83,14 @@ pub struct PlaneState {
 
 impl PlaneState {
     /// Takes a batch from a local scope.
-    pub fn ingest(&mut self, now: Instant, wall_ns: u64, topic: TopicId, from: Scope, batch: &mut Vec<Received>) {
+    pub fn ingest(
+        &mut self,
+        now: Instant,
+        wall_ns: u64,
+        topic: TopicId,
+        from: Scope,
+        batch: &mut Vec<Received>,
+    ) {
         self.core.ingest(now, wall_ns, topic, from, batch, &mut self.engine);
     }
 
@@ -116,15 +124,13 @@ impl PlaneState {
         while let Some(event) = self.engine.as_mut().and_then(Engine::poll_event) {
             match event {
                 LinkEvent::Deliver { frame, .. } => self.core.deliver(now, frame, &mut self.engine),
-                LinkEvent::LaneSent { lane, bytes, wait } => self.core.lane_sent(now, lane, bytes as u64, wait),
+                LinkEvent::LaneSent { lane, bytes, wait } => {
+                    self.core.lane_sent(now, lane, bytes as u64, wait)
+                }
                 LinkEvent::LaneOut { lane, bytes } => self.core.lane_out(lane, 1, bytes as u64),
                 LinkEvent::LaneCut { lane, begun } => self.core.lane_cut(lane, begun),
                 LinkEvent::LaneDropped { lane, reason } => self.core.lane_dropped(lane, reason, 1),
-                LinkEvent::ReceiverDropped {
-                    topic,
-                    reason,
-                    messages,
-                } => {
+                LinkEvent::ReceiverDropped { topic, reason, messages } => {
                     self.core.receiver_dropped(&topic, reason, messages);
                 }
                 LinkEvent::WrittenAsked { from, topic, token } => {
@@ -208,7 +214,8 @@ impl Plane {
         let (result, told, turns) = {
             let mut state = self.state.lock();
             let result = action(&mut state);
-            // Told under the lock: who is up and who is down must reach the control core in the order of its happening.
+            // Told under the lock: who is up and who is down must reach the control core in the
+            // order of its happening.
             let mut told = false;
             state.pump(Instant::now(), |event| {
                 told = true;
@@ -250,7 +257,8 @@ impl Plane {
         self.codec.get().map(|codec| &codec.pool)
     }
 
-    /// Ends the threads that compress, each after the payload that it is at. What waits for them is dropped; what comes after goes as it is.
+    /// Ends the threads that compress, each after the payload that it is at. What waits for them is
+    /// dropped; what comes after goes as it is.
     pub fn stop_compression(&self) {
         if let Some(codec) = self.codec.get() {
             codec.pool.stop();
@@ -258,8 +266,8 @@ impl Plane {
         }
     }
 
-    /// One turn: what is to be done is done without the lock. A panic of the codec ends there; one of the message path ends the thread, and
-    /// with it the process. Returns the turns that follow.
+    /// One turn: what is to be done is done without the lock. A panic of the codec ends there; one
+    /// of the message path ends the thread, and with it the process. Returns the turns that follow.
     fn take_turn(&self, begin: impl FnOnce(&mut PlaneState) -> Option<PressJob>) -> Turns {
         let Some(codec) = self.codec.get() else {
             return Turns::default();
@@ -329,7 +337,8 @@ impl Plane {
         }
     }
 
-    /// The next datagram to send, or how long there is nothing to do (at most `idle`). Waits that long.
+    /// The next datagram to send, or how long there is nothing to do (at most `idle`). Waits that
+    /// long.
     pub fn next_transmit(&self, idle: Duration) -> Next {
         self.transmit(idle, Engine::poll_transmit)
     }
@@ -342,7 +351,11 @@ impl Plane {
         }
     }
 
-    fn transmit(&self, idle: Duration, next: impl Fn(&mut Engine, Instant) -> Option<Transmit>) -> Next {
+    fn transmit(
+        &self,
+        idle: Duration,
+        next: impl Fn(&mut Engine, Instant) -> Option<Transmit>,
+    ) -> Next {
         let mut told = false;
         let (next, turns) = {
             let mut state = self.state.lock();
@@ -438,7 +451,8 @@ impl Plane {
         self.news_dropped.load(Ordering::Relaxed)
     }
 
-    /// Puts an event into the inbox. Called with the state locked; the inbox is never locked the other way round.
+    /// Puts an event into the inbox. Called with the state locked; the inbox is never locked the
+    /// other way round.
     fn tell(&self, event: LinkEvent) {
         let mut news = self.news.lock();
         // Who is there and who is not must not be lost; what peers repeat may be.

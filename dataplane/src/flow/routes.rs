@@ -1,4 +1,5 @@
-//! Makes reality equal to the plan: writers of brokers, and one task for each (topic, scope) that is read.
+//! Makes reality equal to the plan: writers of brokers, and one task for each (topic, scope) that
+//! is read.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -43,7 +44,8 @@ impl LocalBrokers {
 
     /// Scopes whose broker keeps leases.
     pub(super) fn lease_stores(&self) -> BTreeSet<Scope> {
-        let keeps = |scope: &Scope| self.of(*scope).is_some_and(|broker| broker.flow_side().is_some());
+        let keeps =
+            |scope: &Scope| self.of(*scope).is_some_and(|broker| broker.flow_side().is_some());
         [Scope::Node, Scope::Layer].into_iter().filter(keeps).collect()
     }
 }
@@ -79,17 +81,18 @@ impl Routes {
     /// Without any route.
     #[must_use]
     pub(super) fn new(plane: Arc<Plane>, brokers: LocalBrokers, supervisor: Supervisor) -> Self {
-        Self {
-            plane,
-            brokers,
-            supervisor,
-            sources: Mutex::default(),
-        }
+        Self { plane, brokers, supervisor, sources: Mutex::default() }
     }
 
-    /// Makes the bridges of a topic equal to its plan. Where the flow gives up to carry it out of the layer: the offsets that
-    /// the next one begins at, by partition, if the broker has any.
-    pub(super) fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo, duty: &Duty) -> Option<Vec<i64>> {
+    /// Makes the bridges of a topic equal to its plan. Where the flow gives up to carry it out of
+    /// the layer: the offsets that the next one begins at, by partition, if the broker has any.
+    pub(super) fn apply(
+        &self,
+        topic: &TopicName,
+        plan: &TopicPlan,
+        info: TopicInfo,
+        duty: &Duty,
+    ) -> Option<Vec<i64>> {
         let now = Instant::now();
         let held = self.plane.read(|state| {
             state.core.find(topic.as_str())?;
@@ -113,7 +116,9 @@ impl Routes {
         let local = plan.bridges.iter().zip(held);
         let mut writers: Vec<(Scope, &Target, Result<NewWriter, String>)> = local
             .filter(|(bridge, _)| bridge.to.receiver().is_none())
-            .map(|(bridge, held)| (bridge.from, &bridge.to, self.writer(topic, bridge, large, held)))
+            .map(|(bridge, held)| {
+                (bridge.from, &bridge.to, self.writer(topic, bridge, large, held))
+            })
             .collect();
         let applied = self.plane.with(|state| {
             let id = state.core.intern(topic, now)?;
@@ -137,18 +142,9 @@ impl Routes {
             return None;
         };
         for (scope, wanted, with_kept) in reads {
-            let anew = matches!(duty, Duty::Takes(begin) if scope == Scope::Layer && *begin != Begin::Now);
-            self.read(
-                &Reading {
-                    id,
-                    topic,
-                    scope,
-                    large,
-                    with_kept,
-                },
-                wanted,
-                anew,
-            );
+            let anew =
+                matches!(duty, Duty::Takes(begin) if scope == Scope::Layer && *begin != Begin::Now);
+            self.read(&Reading { id, topic, scope, large, with_kept }, wanted, anew);
         }
         (*duty == Duty::GivesUp && !stopped_at.is_empty()).then_some(stopped_at)
     }
@@ -199,7 +195,8 @@ impl Routes {
             reliable: lane.reliable,
             large,
         };
-        // While the one that it had holds messages, another could overtake it: the reconcile tries again.
+        // While the one that it had holds messages, another could overtake it: the reconcile tries
+        // again.
         let keeps = |held: &NewWriter| held.options == options || held.publisher.later().queued > 0;
         if let Some(held) = held.filter(keeps) {
             return Ok(held);
@@ -211,15 +208,10 @@ impl Routes {
         Ok(NewWriter { publisher, options })
     }
 
-    /// Reads a scope for a topic, or no longer. `anew`: bridges out of the layer begin elsewhere than where it is read now.
+    /// Reads a scope for a topic, or no longer. `anew`: bridges out of the layer begin elsewhere
+    /// than where it is read now.
     fn read(&self, reading: &Reading<'_>, wanted: bool, anew: bool) {
-        let &Reading {
-            id,
-            topic,
-            scope,
-            large,
-            with_kept,
-        } = reading;
+        let &Reading { id, topic, scope, large, with_kept } = reading;
         let mut sources = self.sources.lock();
         let held = sources.remove(&(id, scope));
         if !wanted {
@@ -237,7 +229,14 @@ impl Routes {
                 return;
             }
             Some(source) => {
-                tracing::info!(%topic, %scope, large, with_kept, takes_over = anew, "the subscription begins anew");
+                tracing::info!(
+                    %topic,
+                    %scope,
+                    large,
+                    with_kept,
+                    takes_over = anew,
+                    "the subscription begins anew",
+                );
                 source.task.stop();
                 Some(source.task)
             }
@@ -251,22 +250,13 @@ impl Routes {
             channel: topic.into(),
             topic: id,
             scope,
-            options: SubscribeOptions {
-                large,
-                with_kept,
-                ..SubscribeOptions::default()
-            },
+            options: SubscribeOptions { large, with_kept, ..SubscribeOptions::default() },
             state: Arc::clone(&state),
             before,
         };
         let name = format!("source {scope} {topic}");
         let task = self.supervisor.spawn(name, TaskPolicy::Essential, source.run());
-        let source = Source {
-            task,
-            state,
-            large,
-            with_kept,
-        };
+        let source = Source { task, state, large, with_kept };
         sources.insert((id, scope), source);
     }
 }
@@ -305,11 +295,7 @@ impl SourceTask {
         };
         let mut reported = false;
         loop {
-            match self
-                .broker
-                .subscribe_from(&self.channel, self.options, begin.clone())
-                .await
-            {
+            match self.broker.subscribe_from(&self.channel, self.options, begin.clone()).await {
                 Ok(mut subscription) => {
                     // What comes after an outage begins then.
                     begin = Begin::Now;
@@ -331,12 +317,17 @@ impl SourceTask {
                 }
                 Err(error) => {
                     if !std::mem::replace(&mut reported, true) {
-                        tracing::warn!(channel = %self.channel, scope = %self.scope, %error, "cannot subscribe, trying on");
+                        tracing::warn!(
+                            channel = %self.channel,
+                            scope = %self.scope,
+                            %error,
+                            "cannot subscribe, trying on",
+                        );
                     }
                     *self.state.lock() = match error {
-                        BrokerError::Name { .. } | BrokerError::Collision { .. } | BrokerError::TooManyChannels(_) => {
-                            SourceState::Failed(error.to_string())
-                        }
+                        BrokerError::Name { .. }
+                        | BrokerError::Collision { .. }
+                        | BrokerError::TooManyChannels(_) => SourceState::Failed(error.to_string()),
                         BrokerError::Away(_) | BrokerError::Closed => SourceState::Starting,
                     };
                 }

@@ -1,4 +1,5 @@
-//! Follows the broker of one local scope: whether it is there, whose it is, and the leases that it keeps.
+//! Follows the broker of one local scope: whether it is there, whose it is, and the leases that it
+//! keeps.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -19,7 +20,8 @@ pub(super) struct ScopeTask {
     pub(super) shared: Arc<Shared>,
     pub(super) scope: Scope,
     pub(super) broker: Arc<dyn Broker>,
-    /// Becomes true when it is known whether another layer has the scope; leases are not read before.
+    /// Becomes true when it is known whether another layer has the scope; leases are not read
+    /// before.
     pub(super) listened: watch::Receiver<bool>,
     pub(super) stop: CancellationToken,
 }
@@ -35,18 +37,25 @@ impl ScopeTask {
                 control.set_scope_health(Instant::now(), self.scope, scope_health(health));
                 control.is_reading_leases(self.scope)
             };
-            let load = load(
-                side.as_ref().filter(|_| reading && health == Health::Up),
-                &mut self.listened,
-            );
+            let load =
+                load(side.as_ref().filter(|_| reading && health == Health::Up), &mut self.listened);
             tokio::select! {
                 () = self.stop.cancelled() => return,
                 () = changed(&mut status) => {}
                 kept = load => {
-                    let restored = self.shared.control.lock().restore_leases(Instant::now(), self.scope, &kept);
+                    let restored =
+                        self.shared.control.lock()
+                        .restore_leases(Instant::now(), self.scope, &kept);
                     let (restored, newer, foreign, skipped) =
                         (restored.restored, restored.newer, restored.foreign, restored.skipped);
-                    tracing::info!(scope = %self.scope, restored, newer, foreign, skipped, "kept leases are read");
+                    tracing::info!(
+                        scope = %self.scope,
+                        restored,
+                        newer,
+                        foreign,
+                        skipped,
+                        "kept leases are read",
+                    );
                 }
             }
         }
@@ -61,7 +70,10 @@ async fn changed(status: &mut watch::Receiver<BrokerStatus>) {
 }
 
 /// The leases that a broker keeps, however long it takes; never without a broker that keeps any.
-async fn load(side: Option<&Arc<dyn FlowSide>>, listened: &mut watch::Receiver<bool>) -> Vec<(String, bytes::Bytes)> {
+async fn load(
+    side: Option<&Arc<dyn FlowSide>>,
+    listened: &mut watch::Receiver<bool>,
+) -> Vec<(String, bytes::Bytes)> {
     let Some(side) = side else {
         return std::future::pending().await;
     };

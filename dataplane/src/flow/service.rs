@@ -1,4 +1,5 @@
-//! The flow as a service of its node: `blaze-flow` has a configuration in BlazeConfig and shows that it lives.
+//! The flow as a service of its node: `blaze-flow` has a configuration in BlazeConfig and shows
+//! that it lives.
 //!
 //! ```text
 //! worker ─► local broker ─► ProgramConfig ─► over the node file ─► follow_node_file
@@ -15,14 +16,17 @@ use blaze_domain::node_file::RedisBroker;
 use blaze_domain::{Scope, ServiceName};
 use blaze_runtime::config::Verdict;
 use blaze_runtime::{Readiness, Supervisor, TaskPolicy};
-use blaze_sdk::{CacheManager, ProgramConfig, SdkError, ServiceManager, ServiceOptions, ServiceState};
+use blaze_sdk::{
+    CacheManager, ProgramConfig, SdkError, ServiceManager, ServiceOptions, ServiceState,
+};
 
 use super::RunningFlow;
 use super::node_file::{Followed, follow_node_file};
 
 /// The name under which flows have their configuration.
 pub const NAME: &str = "blaze-flow";
-/// How long a flow that was ready is not, before others hear of it: a broker that comes back is met in steps.
+/// How long a flow that was ready is not, before others hear of it: a broker that comes back is met
+/// in steps.
 const UNHEALTHY_AFTER: Duration = Duration::from_secs(3);
 /// How long the end waits for the sign of life to be taken away.
 const LEAVE_WITHIN: Duration = Duration::from_secs(1);
@@ -34,8 +38,9 @@ pub struct FlowService {
 }
 
 impl FlowService {
-    /// Makes the flow a service on its own broker, that of the node if there is one, else that of the layer. `None`: it has
-    /// neither. `cache` is where its sign of life goes; without it, or if it can never work, that is a message.
+    /// Makes the flow a service on its own broker, that of the node if there is one, else that of
+    /// the layer. `None`: it has neither. `cache` is where its sign of life goes; without it, or if
+    /// it can never work, that is a message.
     ///
     /// # Errors
     /// `BLAZE_INSTANCE` is no name.
@@ -102,10 +107,7 @@ impl FlowService {
 
     /// Takes the sign of life away. Before the flow's brokers are closed.
     pub async fn stop(self) {
-        if tokio::time::timeout(LEAVE_WITHIN, self.manager.shutdown())
-            .await
-            .is_err()
-        {
+        if tokio::time::timeout(LEAVE_WITHIN, self.manager.shutdown()).await.is_err() {
             tracing::debug!("the sign of life is left to vanish by itself");
         }
     }
@@ -115,7 +117,10 @@ impl FlowService {
 async fn started(options: ServiceOptions) -> Result<ServiceManager, SdkError> {
     match ServiceManager::start(options.clone()).await {
         Err(SdkError::Cache(error)) => {
-            tracing::error!(%error, "cache.redis cannot be used: the sign of life goes as messages on blaze/watchdog");
+            tracing::error!(
+                %error,
+                "cache.redis cannot be used: the sign of life goes as messages on blaze/watchdog",
+            );
             ServiceManager::start(ServiceOptions { cache: None, ..options }).await
         }
         started => started,
@@ -159,7 +164,8 @@ mod tests {
 
     use super::*;
 
-    /// The options of a flow's service on a node's broker, one who reads there, and the signs of life that it gets.
+    /// The options of a flow's service on a node's broker, one who reads there, and the signs of
+    /// life that it gets.
     async fn on_node() -> (ServiceOptions, MemoryBroker, Subscription) {
         let hub = MemoryHub::new("node");
         let (reader, watchdog) = (hub.broker(), "blaze/watchdog".parse().unwrap());
@@ -172,7 +178,8 @@ mod tests {
     #[tokio::test]
     async fn a_cache_that_can_never_work_keeps_no_flow_from_being_a_service() {
         let (options, _reader, mut beats) = on_node().await;
-        let cache = json!({ "redis": { "url": "redis://127.0.0.1:1", "password_file": "not/there" } });
+        let cache =
+            json!({ "redis": { "url": "redis://127.0.0.1:1", "password_file": "not/there" } });
         let (file, _) = NodeFile::read(&json!({ "cache": cache })).unwrap();
         let cache = Some(file.cache_redis().unwrap().clone());
         let options = ServiceOptions { cache, ..options };
@@ -212,7 +219,9 @@ mod tests {
         let mut batch = Vec::new();
         beats.receive(&mut batch, 1000).await;
         let states = batch.iter().map(|received| match &received.content {
-            Content::Bare { payload, .. } => serde_json::from_slice::<Value>(payload).unwrap()["state"].clone(),
+            Content::Bare { payload, .. } => {
+                serde_json::from_slice::<Value>(payload).unwrap()["state"].clone()
+            }
             other => panic!("{other:?}"),
         });
         let mut states: Vec<Value> = states.collect();

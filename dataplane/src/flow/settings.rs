@@ -2,7 +2,9 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 
-use blaze_domain::node_file::{AccessRules, AutoBool, BandwidthSection, Chunking, FlowSection, NodeFile};
+use blaze_domain::node_file::{
+    AccessRules, AutoBool, BandwidthSection, Chunking, FlowSection, NodeFile,
+};
 use blaze_domain::{FlowId, LayerKind};
 
 use crate::lane::press::CompressionRules;
@@ -45,14 +47,9 @@ impl From<&FlowSection> for LiveSettings {
     fn from(flow: &FlowSection) -> Self {
         Self {
             bandwidth: flow.bandwidth.clone(),
-            compression: CompressionRules {
-                base: flow.compression,
-                topics: flow.topics.clone(),
-            },
+            compression: CompressionRules { base: flow.compression, topics: flow.topics.clone() },
             pool_threads: flow.pool_threads,
-            rules: PlanRules {
-                topics: flow.topics.clone(),
-            },
+            rules: PlanRules { topics: flow.topics.clone() },
             access: flow.access.clone(),
         }
     }

@@ -20,13 +20,17 @@ use crate::lane::path::{BridgeState as Bridge, Phase};
 use crate::plan::TopicPlan;
 use crate::registry::{LapseReason, LapsedLease};
 use crate::why::{
-    BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, StepKind, WhyInput, WhyTarget, explain,
+    BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, StepKind, WhyInput,
+    WhyTarget, explain,
 };
 
 /// Lapsed leases that are looked at.
 const MAX_HINTS: usize = 16;
 
-pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap<String, String>>) -> Response {
+pub(super) async fn why(
+    State(shared): State<Arc<Shared>>,
+    query: Query<BTreeMap<String, String>>,
+) -> Response {
     let Some(text) = query_text(&query, "topic").filter(|text| !text.is_empty()) else {
         return refusal(
             StatusCode::BAD_REQUEST,
@@ -39,13 +43,21 @@ pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap
         Ok(topic) => topic,
         Err(error) => {
             let remedy = format!("No topic has such a name: it {error}.");
-            return nothing_such(&shared, &text, asked_to.as_deref(), WhyCode::NoAdvertise, &remedy);
+            return nothing_such(
+                &shared,
+                &text,
+                asked_to.as_deref(),
+                WhyCode::NoAdvertise,
+                &remedy,
+            );
         }
     };
     let to: Option<WhyTarget> = match asked_to.as_deref().map(str::parse).transpose() {
         Ok(to) => to,
         Err(error) => {
-            let remedy = format!("Nobody has such a name: to is layer[/node[/service]], and a part of it {error}.");
+            let remedy = format!(
+                "Nobody has such a name: to is layer[/node[/service]], and a part of it {error}."
+            );
             return nothing_such(&shared, &text, asked_to.as_deref(), WhyCode::NoRequest, &remedy);
         }
     };
@@ -68,9 +80,16 @@ pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap
 }
 
 /// The verdict for names that nothing can have.
-fn nothing_such(shared: &Shared, topic: &str, to: Option<&str>, code: WhyCode, remedy: &str) -> Response {
+fn nothing_such(
+    shared: &Shared,
+    topic: &str,
+    to: Option<&str>,
+    code: WhyCode,
+    remedy: &str,
+) -> Response {
     let verdict = json!({
-        "topic": topic, "to": to, "verdict": "not_flowing", "code": code, "remedy": remedy, "steps": [],
+        "topic": topic, "to": to, "verdict": "not_flowing", "code": code, "remedy": remedy,
+        "steps": [],
     });
     answer(shared, verdict).into_response()
 }
@@ -79,9 +98,12 @@ fn bridge_facts(shared: &Shared, topic: &TopicName) -> Vec<BridgeFacts> {
     let found = shared.plane.read(|state| {
         let id = state.core.find(topic.as_str())?;
         let path = state.core.path_mut(id);
-        let live = |bridge: &&mut Bridge| matches!(bridge.phase, Phase::Up { .. } | Phase::Failed { .. });
-        let mut facts: Vec<BridgeFacts> = path.bridges.iter_mut().filter(live).map(facts_of).collect();
-        // What was refused on the way in never reached a bridge, and yet is missing behind those that read its scope.
+        let live =
+            |bridge: &&mut Bridge| matches!(bridge.phase, Phase::Up { .. } | Phase::Failed { .. });
+        let mut facts: Vec<BridgeFacts> =
+            path.bridges.iter_mut().filter(live).map(facts_of).collect();
+        // What was refused on the way in never reached a bridge, and yet is missing behind those
+        // that read its scope.
         for fact in &mut facts {
             let refused = path.refused_lately(fact.from);
             *fact.dropped.entry(DropReason::TooLarge).or_default() += refused.too_large;
@@ -129,14 +151,11 @@ fn broker_facts(broker: &dyn Broker) -> BrokerFacts {
         Health::Up if status.detail.is_empty() => (kind, BrokerHealth::Up, String::new()),
         Health::Up => (status.detail, BrokerHealth::Up, String::new()),
         Health::InUse => (kind, BrokerHealth::InUse, status.detail),
-        Health::Connecting | Health::Down | Health::Closed => (kind, BrokerHealth::Down, status.detail),
+        Health::Connecting | Health::Down | Health::Closed => {
+            (kind, BrokerHealth::Down, status.detail)
+        }
     };
-    BrokerFacts {
-        name,
-        health,
-        detail,
-        at_most_once: broker.kind() == BrokerKind::Redis,
-    }
+    BrokerFacts { name, health, detail, at_most_once: broker.kind() == BrokerKind::Redis }
 }
 
 fn route_facts(control: &ControlCore, topic: &TopicName) -> Vec<RouteFacts> {

@@ -1,4 +1,5 @@
-//! The way in of a message from a local scope: its identity, its origin, whether it was seen before, its age.
+//! The way in of a message from a local scope: its identity, its origin, whether it was seen
+//! before, its age.
 
 use std::time::Instant;
 
@@ -19,8 +20,8 @@ use super::window::DuplicateWindow;
 pub(super) enum Refusal {
     /// It counts under this reason.
     Dropped(DropReason),
-    /// The rules of `flow.access` do not let its origin publish it. It counts as one of a foreign origin; whoever asks why is told which
-    /// of the two it was.
+    /// The rules of `flow.access` do not let its origin publish it. It counts as one of a foreign
+    /// origin; whoever asks why is told which of the two it was.
     Denied,
 }
 
@@ -60,7 +61,13 @@ pub(super) struct Admitted {
 }
 
 impl Admitted {
-    pub(super) fn new(now: Instant, frame: Frame, born_here: bool, age_us: u64, here_us: u64) -> Self {
+    pub(super) fn new(
+        now: Instant,
+        frame: Frame,
+        born_here: bool,
+        age_us: u64,
+        here_us: u64,
+    ) -> Self {
         let hops = frame.hops();
         Self {
             frame: frame.with_hops_and_age(hops.saturating_add(1), age_us),
@@ -102,7 +109,13 @@ impl DataCore {
             Content::Malformed { .. } => return Err(DropReason::DecodeError.into()),
             Content::Frame(frame) => (frame, false),
             Content::Bare { payload, identity } => (
-                self.wrap(wall_ns.saturating_sub(waited_us * 1000), topic, from, payload, identity)?,
+                self.wrap(
+                    wall_ns.saturating_sub(waited_us * 1000),
+                    topic,
+                    from,
+                    payload,
+                    identity,
+                )?,
                 true,
             ),
         };
@@ -125,7 +138,8 @@ impl DataCore {
             Scope::Node => !(own_layer && own_node),
             Scope::Layer | Scope::Inter => born_here && !own_layer,
         };
-        // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
+        // Before the window takes the number: a foreign message must not silence the writer whose
+        // name it bears.
         if foreign {
             return Err(DropReason::ForeignOrigin.into());
         }
@@ -135,11 +149,7 @@ impl DataCore {
         // What is read again was noted the first time; the flow that gets it drops what it had.
         if meant != For::Outside && !self.is_new(topic, &frame) {
             // What a flow has written carries hops; a publisher that repeats itself does not.
-            let repeat = if born_here {
-                DropReason::Duplicate
-            } else {
-                DropReason::Echo
-            };
+            let repeat = if born_here { DropReason::Duplicate } else { DropReason::Echo };
             return Err(repeat.into());
         }
         let mut age_us = frame.age_us().saturating_add(waited_us);
@@ -152,11 +162,7 @@ impl DataCore {
         path.largest_bytes = path.largest_bytes.max(bytes);
         path.in_rate.add(now, bytes);
         let here_us = micros(now.saturating_duration_since(at));
-        Ok(Admitted {
-            kept,
-            meant,
-            ..Admitted::new(now, frame, born_here, age_us, here_us)
-        })
+        Ok(Admitted { kept, meant, ..Admitted::new(now, frame, born_here, age_us, here_us) })
     }
 
     /// Gives a bare payload its header.
@@ -179,11 +185,7 @@ impl DataCore {
             (*writer, *sequence)
         });
         let info = path.info.bare(from);
-        let node = if from == Scope::Node {
-            config.me.node.to_string()
-        } else {
-            String::new()
-        };
+        let node = if from == Scope::Node { config.me.node.to_string() } else { String::new() };
         let origin = Origin {
             layer: config.me.layer.to_string(),
             node,
@@ -206,12 +208,14 @@ impl DataCore {
         self.note_sequence(topic, frame, DuplicateWindow::insert)
     }
 
-    /// The same of a message that came over the link. One that is older than the newest of its writer comes too late, seen or not: it would
-    /// be written behind newer ones. That is so where another flow begins to carry the topic, a second back so that nothing is missed, and
-    /// sends what the one before it could not. It is not so of what is kept for late joiners.
+    /// The same of a message that came over the link. One that is older than the newest of its
+    /// writer comes too late, seen or not: it would be written behind newer ones. That is so where
+    /// another flow begins to carry the topic, a second back so that nothing is missed, and sends
+    /// what the one before it could not. It is not so of what is kept for late joiners.
     pub(super) fn is_new_here(&mut self, now: Instant, topic: TopicId, frame: &Frame) -> bool {
         if frame.depth() > 0 {
-            // Its flow was away for so long that it counted as gone: those who join late would never get what it sends again.
+            // Its flow was away for so long that it counted as gone: those who join late would
+            // never get what it sends again.
             if self.kept.takes_again(now, topic, frame.writer()) {
                 self.windows.pop(&(topic, frame.writer()));
             }
@@ -220,7 +224,12 @@ impl DataCore {
         self.note_sequence(topic, frame, DuplicateWindow::insert_newer)
     }
 
-    fn note_sequence(&mut self, topic: TopicId, frame: &Frame, insert: fn(&mut DuplicateWindow, u64) -> bool) -> bool {
+    fn note_sequence(
+        &mut self,
+        topic: TopicId,
+        frame: &Frame,
+        insert: fn(&mut DuplicateWindow, u64) -> bool,
+    ) -> bool {
         let key = (topic, frame.writer());
         if let Some(window) = self.windows.get_mut(&key) {
             return insert(window, frame.sequence());
@@ -235,8 +244,8 @@ impl DataCore {
     }
 }
 
-/// Writer of bare messages that this flow numbers: new at each start of the flow, and where a topic is there again that was
-/// forgotten, as its numbers begin again.
+/// Writer of bare messages that this flow numbers: new at each start of the flow, and where a topic
+/// is there again that was forgotten, as its numbers begin again.
 fn bare_writer(config: &DataConfig, from: Scope, topic: &str, life: u64) -> WriterId {
     use sha2::{Digest, Sha256};
     let text = format!(

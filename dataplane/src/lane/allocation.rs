@@ -1,11 +1,12 @@
 //! What the allocator of F9 is told of the lanes, and what its word means for them.
 //!
-//! A lane is all of a topic that goes to one receiver: what is published on the node scope and what is published on the layer scope share
-//! it, its rate and its bucket.
+//! A lane is all of a topic that goes to one receiver: what is published on the node scope and what
+//! is published on the layer scope share it, its rate and its bucket.
 //!
-//! A lane is thinned where the budget does not hold what is published. One that gets all of it is not: a publisher is never quite
-//! regular, and a bucket at just its rate would skip a message now and then. Who publishes more than a tenth faster than was advertised is
-//! held to what was advertised; but not where a lane is reliable: there what is published counts as advertised.
+//! A lane is thinned where the budget does not hold what is published. One that gets all of it is
+//! not: a publisher is never quite regular, and a bucket at just its rate would skip a message now
+//! and then. Who publishes more than a tenth faster than was advertised is held to what was
+//! advertised; but not where a lane is reliable: there what is published counts as advertised.
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
@@ -23,7 +24,8 @@ use crate::limit::rates::{Demand, LaneDemand, Rates};
 use crate::limit::wire_factor::MAX_LAYERS;
 use crate::link::{Begun, LaneId};
 
-/// A measured rate is believed anew when it has moved by this share, and a publisher may be so much faster than it says.
+/// A measured rate is believed anew when it has moved by this share, and a publisher may be so much
+/// faster than it says.
 const MOVED: f64 = 0.1;
 /// Rounding of rates.
 const ROUNDING: f64 = 1e-9;
@@ -57,8 +59,9 @@ pub(super) struct Published {
 }
 
 impl Published {
-    /// Takes what was measured: the mean of late, and that of a whole [`WINDOW`] where there is one. A regular publisher has a message more in
-    /// some windows than in others, which for a slow one is more than a tenth.
+    /// Takes what was measured: the mean of late, and that of a whole [`WINDOW`] where there is
+    /// one. A regular publisher has a message more in some windows than in others, which for a slow
+    /// one is more than a tenth.
     fn take(&mut self, hz: f64, of_window_hz: Option<f64>, said_hz: Option<f64>) {
         if (hz - self.believed_hz).abs() > MOVED * self.believed_hz {
             self.believed_hz = hz;
@@ -162,7 +165,8 @@ impl LaneGates {
     /// Whether a message may pass to a receiver now.
     ///
     /// # Errors
-    /// `rate_limit` where the budget is what holds it back, `max_rate` where nobody there asks for more.
+    /// `rate_limit` where the budget is what holds it back, `max_rate` where nobody there asks for
+    /// more.
     pub fn admit(&mut self, now: Instant, receiver: &FlowId) -> Result<(), DropReason> {
         match self.0.iter_mut().find(|gate| gate.receiver == *receiver) {
             Some(gate) => gate.bucket.admit(now).then_some(()).ok_or(gate.reason),
@@ -198,7 +202,8 @@ impl LaneGates {
     }
 }
 
-/// `s` of the messages that were sent, added up since the start: what wire bytes are compared with. Each copy counts.
+/// `s` of the messages that were sent, added up since the start: what wire bytes are compared with.
+/// Each copy counts.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Reckoned {
     /// To all layers.
@@ -245,7 +250,8 @@ pub struct TopicFacts {
 pub struct LaneFacts {
     /// Its receiver.
     pub receiver: FlowId,
-    /// What the budget allows, in Hz; `None` while that is not worked out, and of a lane that only empties its queue.
+    /// What the budget allows, in Hz; `None` while that is not worked out, and of a lane that only
+    /// empties its queue.
     pub allocated_hz: Option<f64>,
     /// What is asked for at most, in Hz.
     pub asked_hz: Option<f64>,
@@ -282,8 +288,8 @@ impl TopicPath {
         self.offered.add(now, bytes);
     }
 
-    /// As how many bytes a message counts: as many as the allocation takes each of them for. One that is larger has just been seen for
-    /// the first time.
+    /// As how many bytes a message counts: as many as the allocation takes each of them for. One
+    /// that is larger has just been seen for the first time.
     pub(super) fn reckoned_bytes(&self, bytes: u64) -> u64 {
         self.granted.map_or(bytes, |granted| granted.size_bytes.max(bytes))
     }
@@ -293,10 +299,7 @@ impl TopicPath {
         let said = self.info.rate_hz;
         let (hz, of_window) = (self.offered.rate(now).0, self.offered.of_window(now));
         self.published.take(hz, of_window, said);
-        let reliable = self
-            .bridges
-            .iter()
-            .any(|bridge| bridge.leaves() && bridge.lane.reliable);
+        let reliable = self.bridges.iter().any(|bridge| bridge.leaves() && bridge.lane.reliable);
         self.published.told(said, reliable)
     }
 
@@ -339,13 +342,15 @@ impl TopicPath {
         self.bridges.iter_mut().for_each(BridgeState::forget_rates);
     }
 
-    /// Its lanes run as was worked out. Those that have changed meanwhile are left to the next time.
+    /// Its lanes run as was worked out. Those that have changed meanwhile are left to the next
+    /// time.
     fn set_rates(&mut self, now: Instant, topic: &WantedTopic, lanes_hz: &[f64]) {
         let mut held: Vec<&FlowId> = Vec::new();
         for (lane, hz) in topic.lanes.iter().zip(lanes_hz) {
             let asked = lane.max_rate_hz.map_or(topic.told.hz, |most| most.min(topic.told.hz));
             let thinned = *hz < asked * (1.0 - ROUNDING);
-            let exceeds = topic.told.exceeded && !thinned && lane.max_rate_hz.is_none_or(|most| *hz < most);
+            let exceeds =
+                topic.told.exceeded && !thinned && lane.max_rate_hz.is_none_or(|most| *hz < most);
             if thinned || exceeds {
                 self.gates.hold(now, &lane.receiver, *hz, DropReason::RateLimit);
                 held.push(&lane.receiver);
@@ -357,9 +362,7 @@ impl TopicPath {
             for at in &lane.bridges {
                 let same = |bridge: &&mut BridgeState| {
                     bridge.leaves()
-                        && bridge
-                            .receiver()
-                            .is_some_and(|(_, receiver)| *receiver == lane.receiver)
+                        && bridge.receiver().is_some_and(|(_, receiver)| *receiver == lane.receiver)
                 };
                 if let Some(bridge) = self.bridges.get_mut(*at).filter(same) {
                     bridge.allocated_hz = Some(*hz);
@@ -379,13 +382,12 @@ impl TopicPath {
             };
             let actual_hz = bridge.out_rate.rate(now).0;
             let (stats, leaves) = (&bridge.stats, bridge.leaves());
-            let skipped = stats.dropped.get(DropReason::RateLimit) + stats.dropped.get(DropReason::MaxRate);
+            let skipped =
+                stats.dropped.get(DropReason::RateLimit) + stats.dropped.get(DropReason::MaxRate);
             if let Some(lane) = lanes.iter_mut().find(|lane| lane.receiver == receiver) {
                 lane.allocated_hz = lane.allocated_hz.or(bridge.allocated_hz);
-                lane.asked_hz = lane
-                    .asked_hz
-                    .zip(bridge.lane.max_rate_hz)
-                    .map(|(one, other)| one.max(other));
+                lane.asked_hz =
+                    lane.asked_hz.zip(bridge.lane.max_rate_hz).map(|(one, other)| one.max(other));
                 lane.actual_hz += actual_hz;
                 lane.exceeds_advertised |= bridge.exceeds_advertised;
                 lane.skipped += skipped;
@@ -428,8 +430,9 @@ impl DataCore {
         std::mem::take(&mut self.lanes_changed)
     }
 
-    /// Looks whether measured rates have moved, and lets go of sizes that are older than the window; to be called about twice a second.
-    /// Returns whether the rates have to be worked out anew.
+    /// Looks whether measured rates have moved, and lets go of sizes that are older than the
+    /// window; to be called about twice a second. Returns whether the rates have to be worked out
+    /// anew.
     pub fn look_at_rates(&mut self, now: Instant, size_window: Option<Duration>) -> bool {
         let mut changed = false;
         for id in &self.leaving {
@@ -487,8 +490,9 @@ impl DataCore {
         }
     }
 
-    /// What was sent, as the allocation reckons; of messages that are being sent the share that has left. Without that a single image
-    /// on a slow link would move the wire factor, whose wire bytes are counted as they leave.
+    /// What was sent, as the allocation reckons; of messages that are being sent the share that has
+    /// left. Without that a single image on a slow link would move the wire factor, whose wire
+    /// bytes are counted as they leave.
     #[must_use]
     pub fn reckoned(&self, being_sent: impl Iterator<Item = (LaneId, Begun)>) -> Reckoned {
         let mut reckoned = self.reckoned.clone();
@@ -516,8 +520,9 @@ impl DataCore {
         Some((layer, size * begun.parts_sent as u64 / begun.parts.max(1) as u64))
     }
 
-    /// Some of the topics that leave on the inter scope: those that are looked at next after one of them, or the first ones. The second is the last
-    /// that was looked at; `None`: there are no more.
+    /// Some of the topics that leave on the inter scope: those that are looked at next after one of
+    /// them, or the first ones. The second is the last that was looked at; `None`: there are no
+    /// more.
     pub fn allocation_facts(
         &mut self,
         now: Instant,
@@ -525,17 +530,10 @@ impl DataCore {
         most: usize,
     ) -> (Vec<TopicFacts>, Option<TopicId>) {
         let from = after.map_or(Bound::Unbounded, Bound::Excluded);
-        let ids: Vec<TopicId> = self
-            .leaving
-            .range((from, Bound::Unbounded))
-            .take(most)
-            .copied()
-            .collect();
+        let ids: Vec<TopicId> =
+            self.leaving.range((from, Bound::Unbounded)).take(most).copied().collect();
         let topics = &mut self.topics;
-        let facts = ids
-            .iter()
-            .filter_map(|id| topics[id.0 as usize].facts(now, *id))
-            .collect();
+        let facts = ids.iter().filter_map(|id| topics[id.0 as usize].facts(now, *id)).collect();
         (facts, ids.last().copied())
     }
 }
@@ -562,12 +560,9 @@ mod tests {
 
     #[test]
     fn one_message_more_in_a_window_is_no_excess() {
-        for (said, measured, exceeded) in [
-            (1.0, 1.2, false),
-            (1.0, 1.4, true),
-            (0.1, 0.2, false),
-            (50.0, 56.0, true),
-        ] {
+        for (said, measured, exceeded) in
+            [(1.0, 1.2, false), (1.0, 1.4, true), (0.1, 0.2, false), (50.0, 56.0, true)]
+        {
             let mut published = Published::default();
             published.take(measured, Some(measured), Some(said));
             let told = published.told(Some(said), false);

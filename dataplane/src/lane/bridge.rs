@@ -23,8 +23,9 @@ use crate::plan::{Bridge, Target};
 /// Replaced writers of a bridge that may still have something to deliver.
 const MAX_PAST: usize = 4;
 
-/// Time that large messages of a best-effort topic may wait, as long as they do so in turn: two images at 16 Hz. Slower topics, whose
-/// images take longer than that, keep no more than the newest.
+/// Time that large messages of a best-effort topic may wait, as long as they do so in turn: two
+/// images at 16 Hz. Slower topics, whose images take longer than that, keep no more than the
+/// newest.
 const SLACK: Duration = Duration::from_millis(125);
 
 impl BridgeState {
@@ -65,7 +66,8 @@ impl BridgeState {
         begins
     }
 
-    /// Gives a bridge to a local broker its writer, or says why there is none. One that it had goes on delivering.
+    /// Gives a bridge to a local broker its writer, or says why there is none. One that it had goes
+    /// on delivering.
     pub(super) fn set_writer(&mut self, now: Instant, made: Result<NewWriter, String>) {
         let Sink::Publish { writer, past, .. } = &mut self.sink else {
             return;
@@ -89,15 +91,20 @@ impl BridgeState {
             Err(reason) => {
                 if !matches!(self.phase, Phase::Failed { .. }) {
                     self.phase = Phase::Failed { since: now };
-                    tracing::warn!(from = %self.from, to = ?self.target, reason, "a bridge cannot write, trying on");
+                    tracing::warn!(
+                        from = %self.from,
+                        to = ?self.target,
+                        reason,
+                        "a bridge cannot write, trying on",
+                    );
                 }
                 self.failure = Some(reason);
             }
         }
     }
 
-    /// Brings the counters up to date with what the broker's adapter did, and lets go of writers that have nothing more to
-    /// deliver. Returns how many messages wait there.
+    /// Brings the counters up to date with what the broker's adapter did, and lets go of writers
+    /// that have nothing more to deliver. Returns how many messages wait there.
     pub fn settle(&mut self) -> u64 {
         let ended = self.phase == Phase::Ended;
         let Sink::Publish { writer, past, .. } = &mut self.sink else {
@@ -131,22 +138,26 @@ impl BridgeState {
         if message.kept && !self.lane.durable {
             return false;
         }
-        // What a flow wrote stays in the layer: only what was born here leaves for another one, and what a flow that is not on the
-        // inter scope wrote from its node.
-        if matches!(self.target, Target::Inter { .. }) && !message.born_here && !self.relays(message) {
+        // What a flow wrote stays in the layer: only what was born here leaves for another one, and
+        // what a flow that is not on the inter scope wrote from its node.
+        if matches!(self.target, Target::Inter { .. })
+            && !message.born_here
+            && !self.relays(message)
+        {
             return false;
         }
         if self.lane.from.is_empty() {
             return true;
         }
         let frame = &message.frame;
-        self.lane
-            .carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+        self.lane.carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
     }
 
     fn relays(&self, message: &Admitted) -> bool {
         let frame = &message.frame;
-        self.from == Scope::Layer && message.hops == 1 && self.lane.relays(frame.origin_layer(), frame.origin_node())
+        self.from == Scope::Layer
+            && message.hops == 1
+            && self.lane.relays(frame.origin_layer(), frame.origin_node())
     }
 
     /// Whether it is among those that a message is for.
@@ -158,7 +169,8 @@ impl BridgeState {
         }
     }
 
-    /// Takes a message that it wants: filters, counts, and writes it to a broker. Returns what is to go to its lane, if it has one.
+    /// Takes a message that it wants: filters, counts, and writes it to a broker. Returns what is
+    /// to go to its lane, if it has one.
     pub(super) fn pass(
         &mut self,
         now: Instant,
@@ -181,7 +193,8 @@ impl BridgeState {
             return None;
         }
         let admitted = self.admit(now, message, gates);
-        // What the budget skips is asked for, too: a flow that has to skip carries more than one that does not.
+        // What the budget skips is asked for, too: a flow that has to skip carries more than one
+        // that does not.
         if matches!(admitted, Ok(()) | Err(DropReason::RateLimit)) {
             self.load.add(bytes);
         }
@@ -195,8 +208,10 @@ impl BridgeState {
                     self.stats.dropped.add(DropReason::BrokerError, 1);
                     return None;
                 };
-                let deadline = (lifespan_ms > 0)
-                    .then(|| now + Duration::from_millis(lifespan_ms.into()) - Duration::from_micros(message.age_us));
+                let deadline = (lifespan_ms > 0).then(|| {
+                    now + Duration::from_millis(lifespan_ms.into())
+                        - Duration::from_micros(message.age_us)
+                });
                 match writer.publish(frame, *bare, deadline) {
                     PublishOutcome::Taken => {
                         self.stats.latency.record(message.here_us);
@@ -217,9 +232,15 @@ impl BridgeState {
         }
     }
 
-    /// Whether a message may pass: first what is asked for, then what the budget gives the lane. What is kept for late joiners comes at once and is
-    /// not repeated: each of them gets all of it, and the budget is the pacer's then.
-    fn admit(&mut self, now: Instant, message: &Admitted, gates: &mut LaneGates) -> Result<(), DropReason> {
+    /// Whether a message may pass: first what is asked for, then what the budget gives the lane.
+    /// What is kept for late joiners comes at once and is not repeated: each of them gets all of
+    /// it, and the budget is the pacer's then.
+    fn admit(
+        &mut self,
+        now: Instant,
+        message: &Admitted,
+        gates: &mut LaneGates,
+    ) -> Result<(), DropReason> {
         if message.kept {
             return Ok(());
         }
@@ -251,9 +272,17 @@ impl BridgeState {
     }
 
     /// Gives a message to the link.
-    pub(super) fn submit(&mut self, now: Instant, topic: TopicId, mut message: Waiting, link: &mut dyn LaneLink) {
+    pub(super) fn submit(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        mut message: Waiting,
+        link: &mut dyn LaneLink,
+    ) {
         let keep_newest = self.keep_newest();
-        let (Sink::Lane { lane, class }, Target::Inter { receiver, .. }) = (&mut self.sink, &self.target) else {
+        let (Sink::Lane { lane, class }, Target::Inter { receiver, .. }) =
+            (&mut self.sink, &self.target)
+        else {
             return;
         };
         // It was compressed for a receiver before this one.
@@ -277,10 +306,7 @@ impl BridgeState {
             to: receiver,
             class: *class,
             lane: *lane,
-            stream: StreamKey {
-                topic: topic.0,
-                writer: message.frame.writer(),
-            },
+            stream: StreamKey { topic: topic.0, writer: message.frame.writer() },
             // The link adds its own hop.
             frame: message.frame,
             arrived: message.arrived,
@@ -294,8 +320,9 @@ impl BridgeState {
         }
     }
 
-    /// So many large messages of a writer wait at most; 0: only bytes count. Of a fast topic these are as many as leave within [`SLACK`]:
-    /// what is admitted comes as unevenly as it is published, and each that gives way while the link has room for it is missing.
+    /// So many large messages of a writer wait at most; 0: only bytes count. Of a fast topic these
+    /// are as many as leave within [`SLACK`]: what is admitted comes as unevenly as it is
+    /// published, and each that gives way while the link has room for it is missing.
     pub(super) fn keep_newest(&self) -> usize {
         if self.lane.reliable {
             return 0;

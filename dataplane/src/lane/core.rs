@@ -5,8 +5,9 @@
 //! deliver:  link ─► check origin and duplicates ─► each bridge from inter ─► broker
 //! ```
 //!
-//! Without input or output of its own: brokers are writers that never wait, the link is a [`LaneLink`], time is given.
-//! Production holds it behind one lock that is taken once per batch; the simulated network drives the same code.
+//! Without input or output of its own: brokers are writers that never wait, the link is a
+//! [`LaneLink`], time is given. Production holds it behind one lock that is taken once per batch;
+//! the simulated network drives the same code.
 
 use std::collections::{BTreeSet, HashMap};
 use std::num::NonZeroUsize;
@@ -52,7 +53,8 @@ pub trait LaneLink {
     fn submit(&mut self, now: Instant, message: Submit<'_>) -> Result<(), DropReason>;
     /// Messages of a lane that are queued or not yet acknowledged.
     fn queued(&self, lane: LaneId) -> u64;
-    /// Drops what is queued of a lane, and gives how many messages that were; the caller counts them.
+    /// Drops what is queued of a lane, and gives how many messages that were; the caller counts
+    /// them.
     fn drop_lane(&mut self, lane: LaneId) -> u64;
     /// Whether a flow does not acknowledge for the moment, or is not known.
     fn is_suspect(&self, to: &FlowId) -> bool;
@@ -91,8 +93,7 @@ impl LaneLink for Option<Engine> {
         self.as_ref().is_some_and(|engine| engine.takes_lz4(to))
     }
     fn tell(&mut self, to: &FlowId, body: Body) -> bool {
-        self.as_mut()
-            .is_some_and(|engine| engine.send_control(to, body).is_ok())
+        self.as_mut().is_some_and(|engine| engine.send_control(to, body).is_ok())
     }
 }
 
@@ -237,7 +238,8 @@ impl DataCore {
         bridges.any(|bridge| matches!(bridge.phase, Phase::Draining { .. }))
     }
 
-    /// Puts a mark into the counters of every bridge: what happened since the one before is "lately".
+    /// Puts a mark into the counters of every bridge: what happened since the one before is
+    /// "lately".
     pub fn mark(&mut self) {
         self.topics.iter_mut().for_each(TopicPath::mark);
     }
@@ -259,7 +261,8 @@ impl DataCore {
         link: &mut dyn LaneLink,
     ) {
         if from == Scope::Layer && !self.path(topic).reads(from) {
-            // What still comes after the last bridge has gone is nobody's. Who reads on from there must not find it noted.
+            // What still comes after the last bridge has gone is nobody's. Who reads on from there
+            // must not find it noted.
             batch.clear();
             return;
         }
@@ -280,16 +283,13 @@ impl DataCore {
 
     /// Counts what a subscription of this topic dropped because the flow was slow.
     pub fn count_overrun(&mut self, topic: TopicId, messages: u64) {
-        self.topics[topic.0 as usize]
-            .ingress_drops
-            .add(DropReason::QueueFull, messages);
+        self.topics[topic.0 as usize].ingress_drops.add(DropReason::QueueFull, messages);
     }
 
     /// Takes a message that came over the link; its age is right at `now`.
     pub fn deliver(&mut self, now: Instant, frame: Frame, link: &mut dyn LaneLink) {
-        let delivering = self
-            .find(frame.topic())
-            .filter(|topic| self.topics[topic.0 as usize].delivers());
+        let delivering =
+            self.find(frame.topic()).filter(|topic| self.topics[topic.0 as usize].delivers());
         let Some(topic) = delivering else {
             // The sender knew of the pair before this flow did: the bridge may come in a moment.
             let gone = self.early.hold(now, frame);
@@ -316,8 +316,8 @@ impl DataCore {
         self.press_in(now, topic, message, link);
     }
 
-    /// Delivers what waited for the bridges of a topic: what is kept for late joiners, and what came over the link before
-    /// they stood. To be called after [`DataCore::apply`].
+    /// Delivers what waited for the bridges of a topic: what is kept for late joiners, and what
+    /// came over the link before they stood. To be called after [`DataCore::apply`].
     pub fn deliver_waiting(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
         self.deliver_kept(now, topic, link);
         let path = &self.topics[topic.0 as usize];
@@ -332,9 +332,9 @@ impl DataCore {
     fn without_destination(&mut self, frames: Vec<Frame>) {
         for frame in frames {
             match self.find(frame.topic()) {
-                Some(topic) => self.topics[topic.0 as usize]
-                    .ingress_drops
-                    .add(DropReason::NoDestination, 1),
+                Some(topic) => {
+                    self.topics[topic.0 as usize].ingress_drops.add(DropReason::NoDestination, 1)
+                }
                 None => self.unattributed.add(DropReason::NoDestination, 1),
             }
         }
@@ -394,8 +394,8 @@ impl DataCore {
         }
     }
 
-    /// Ends bridges that have drained, sends what was held, and answers questions. Returns when it wants to be called again; calls
-    /// before that cost nothing.
+    /// Ends bridges that have drained, sends what was held, and answers questions. Returns when it
+    /// wants to be called again; calls before that cost nothing.
     pub fn drain(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
         if !self.stirred && self.look_at.is_none_or(|at| now < at) {
             return self.look_at;
@@ -439,11 +439,8 @@ impl DataCore {
         let large = path.is_large(self.config.large_bytes);
         let mut lanes = ToLanes::new();
         let mut offered = false;
-        for (at, bridge) in path
-            .bridges
-            .iter_mut()
-            .enumerate()
-            .filter(|(_, bridge)| bridge.from == from)
+        for (at, bridge) in
+            path.bridges.iter_mut().enumerate().filter(|(_, bridge)| bridge.from == from)
         {
             if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
                 offered |= bridge.lane_id().is_some();

@@ -1,7 +1,8 @@
 //! Messages that came over the link before their bridge stood.
 //!
-//! Both flows learn of a pair by the same announcement, but not at the same moment: the sender may be quicker by some
-//! hundred milliseconds. What it sends then is meant for us and waits here, bounded, until the bridge stands.
+//! Both flows learn of a pair by the same announcement, but not at the same moment: the sender may
+//! be quicker by some hundred milliseconds. What it sends then is meant for us and waits here,
+//! bounded, until the bridge stands.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -10,7 +11,8 @@ use blaze_proto::Frame;
 
 use super::measure::micros;
 
-/// How long a message waits for its bridge: twice what a change of the registry takes to reach the plan.
+/// How long a message waits for its bridge: twice what a change of the registry takes to reach the
+/// plan.
 pub(super) const WAIT: Duration = Duration::from_millis(500);
 /// Messages that wait at most, of all topics; the oldest give way.
 const MAX_MESSAGES: usize = 4_096;
@@ -38,7 +40,9 @@ impl Early {
         }
         self.waiting.push_back((now, frame));
         let mut gone = Vec::new();
-        while self.waiting.len() > MAX_MESSAGES || (self.bytes > MAX_BYTES && self.waiting.len() > 1) {
+        while self.waiting.len() > MAX_MESSAGES
+            || (self.bytes > MAX_BYTES && self.waiting.len() > 1)
+        {
             gone.extend(self.pop());
         }
         gone

@@ -1,7 +1,7 @@
 //! The last messages of transient_local writers, for bridges that begin later.
 //!
-//! A broker keeps them for those who subscribe to it; a bridge that begins while the topic is being read already gets them
-//! from here, and so does a flow that comes back.
+//! A broker keeps them for those who subscribe to it; a bridge that begins while the topic is being
+//! read already gets them from here, and so does a flow that comes back.
 
 use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
@@ -20,15 +20,13 @@ use crate::world::OriginFilter;
 const MAX_WRITERS: usize = 16_384;
 /// Bytes that are kept at most (64 MiB), of all writers; one message always fits.
 const MAX_BYTES: usize = 64 * 1024 * 1024;
-const BOUNDS: RetainedBounds = RetainedBounds {
-    writers: MAX_WRITERS,
-    bytes: MAX_BYTES,
-    bytes_of_writer: MAX_BYTES,
-};
+const BOUNDS: RetainedBounds =
+    RetainedBounds { writers: MAX_WRITERS, bytes: MAX_BYTES, bytes_of_writer: MAX_BYTES };
 /// Messages of one writer that are kept at most, whatever depth it names.
 const MAX_DEPTH: usize = 10_000;
 
-/// After this time what a writer sends that was forgotten is not a copy that was on its way when that was.
+/// After this time what a writer sends that was forgotten is not a copy that was on its way when
+/// that was.
 const AGAIN: Duration = Duration::from_secs(10);
 /// Superseded writers that wait to be fetched at most.
 const MAX_SUPERSEDED: usize = 16_384;
@@ -51,10 +49,7 @@ impl Kept {
         let waited_us = u64::try_from(waited.as_micros()).unwrap_or(u64::MAX);
         let age_us = self.age_us.saturating_add(waited_us);
         let frame = self.frame.clone().with_hops_and_age(self.hops, age_us);
-        Admitted {
-            kept: true,
-            ..Admitted::new(now, frame, self.born_here, age_us, 0)
-        }
+        Admitted { kept: true, ..Admitted::new(now, frame, self.born_here, age_us, 0) }
     }
 }
 
@@ -80,9 +75,7 @@ impl Default for KeptMessages {
 impl KeptMessages {
     /// Keeps a message, if its writer is transient_local.
     pub(super) fn keep(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted) {
-        let depth = usize::try_from(message.frame.depth())
-            .unwrap_or(MAX_DEPTH)
-            .min(MAX_DEPTH);
+        let depth = usize::try_from(message.frame.depth()).unwrap_or(MAX_DEPTH).min(MAX_DEPTH);
         if depth == 0 {
             return;
         }
@@ -110,17 +103,15 @@ impl KeptMessages {
         }
         let gone = self.writers.forget_if(|(at, _), newest| {
             let origin = newest.frame.origin();
-            let same = Origin {
-                epoch: life.epoch,
-                ..origin.clone()
-            };
+            let same = Origin { epoch: life.epoch, ..origin.clone() };
             *at == topic && origin.epoch < life.epoch && same == life
         });
         let room = MAX_SUPERSEDED.saturating_sub(self.superseded.len());
         self.superseded.extend(gone.into_iter().take(room));
     }
 
-    /// What is kept of a topic from one scope, in the order of each writer and otherwise as it came.
+    /// What is kept of a topic from one scope, in the order of each writer and otherwise as it
+    /// came.
     pub(super) fn of(&self, now: Instant, topic: TopicId, from: Scope) -> Vec<Admitted> {
         let mut found: Vec<&Kept> = self
             .writers
@@ -155,7 +146,8 @@ impl KeptMessages {
         gone.into_iter().map(|(_, writer)| writer).collect()
     }
 
-    /// Whether a writer was forgotten a while ago; it is asked once, when something of it comes again.
+    /// Whether a writer was forgotten a while ago; it is asked once, when something of it comes
+    /// again.
     pub(super) fn takes_again(&mut self, now: Instant, topic: TopicId, writer: WriterId) -> bool {
         let key = (topic, writer);
         let since = self.forgotten.peek(&key).map(|at| now.saturating_duration_since(*at));
@@ -188,20 +180,15 @@ mod tests {
             instance: "0".into(),
             epoch,
         };
-        let header = Header {
-            depth: 2,
-            ..Header::new("map", origin, WriterId([writer; 16]), sequence, 0)
-        };
+        let header =
+            Header { depth: 2, ..Header::new("map", origin, WriterId([writer; 16]), sequence, 0) };
         let frame = Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap();
         Admitted::new(Instant::now(), frame, true, 5, 0)
     }
 
     fn sequences(kept: &KeptMessages, now: Instant) -> Vec<(u8, u64)> {
         let found = kept.of(now, TOPIC, Scope::Node);
-        found
-            .iter()
-            .map(|m| (m.frame.writer().0[0], m.frame.sequence()))
-            .collect()
+        found.iter().map(|m| (m.frame.writer().0[0], m.frame.sequence())).collect()
     }
 
     #[test]
@@ -227,17 +214,11 @@ mod tests {
         kept.keep(now, TOPIC, Scope::Node, &message(2, "b", 1, 1, 10));
         kept.keep(now, TOPIC, Scope::Node, &message(3, "a", 2, 1, 10));
         assert_eq!(kept.superseded, [(TOPIC, WriterId([1; 16]))]);
-        let of = OriginFilter {
-            service: Some("b".into()),
-            ..OriginFilter::default()
-        };
+        let of = OriginFilter { service: Some("b".into()), ..OriginFilter::default() };
         let any = BTreeSet::from([OriginFilter::default()]);
         assert_eq!(kept.forget(now, TOPIC, &of, &any), [], "somebody says that it is there");
         assert_eq!(kept.forget(now, TOPIC, &of, &BTreeSet::new()), [WriterId([2; 16])]);
-        assert!(
-            !kept.takes_again(now, TOPIC, WriterId([2; 16])),
-            "a copy that was on its way"
-        );
+        assert!(!kept.takes_again(now, TOPIC, WriterId([2; 16])), "a copy that was on its way");
         assert!(!kept.takes_again(now + AGAIN, TOPIC, WriterId([1; 16])));
         assert!(kept.takes_again(now + AGAIN, TOPIC, WriterId([2; 16])));
         assert!(!kept.takes_again(now + AGAIN, TOPIC, WriterId([2; 16])), "once");

@@ -1,4 +1,5 @@
-//! How much each bridge carries, and which topics could be given to another flow now without the loss of a message.
+//! How much each bridge carries, and which topics could be given to another flow now without the
+//! loss of a message.
 
 use std::time::{Duration, Instant};
 
@@ -14,11 +15,12 @@ const TAU: Duration = Duration::from_secs(10);
 const SAMPLE: Duration = Duration::from_millis(500);
 /// A rate that was measured for this long is good enough to move a topic by.
 const KNOWN_AFTER: Duration = Duration::from_secs(5);
-/// A lane that needs longer than this for what waits in it is too far behind to be emptied in passing.
+/// A lane that needs longer than this for what waits in it is too far behind to be emptied in
+/// passing.
 const BEHIND: Duration = Duration::from_millis(250);
 
-/// Bytes per second as an exponentially weighted mean over about 10 s. It counts nothing before its beginning, so a young one
-/// shows the mean since then.
+/// Bytes per second as an exponentially weighted mean over about 10 s. It counts nothing before its
+/// beginning, so a young one shows the mean since then.
 #[derive(Debug, Clone)]
 pub struct LoadMeter {
     counted: u64,
@@ -32,13 +34,7 @@ impl LoadMeter {
     /// A meter that has counted nothing.
     #[must_use]
     pub fn new(now: Instant) -> Self {
-        Self {
-            counted: 0,
-            sampled: 0,
-            at: now,
-            sum: 0.0,
-            weight: 0.0,
-        }
+        Self { counted: 0, sampled: 0, at: now, sum: 0.0, weight: 0.0 }
     }
 
     /// Counts one message.
@@ -97,7 +93,8 @@ pub struct Loads {
 }
 
 impl BridgeState {
-    /// Payload bytes per second that it carries, after its filters and its rate; 0 unless it takes messages in.
+    /// Payload bytes per second that it carries, after its filters and its rate; 0 unless it takes
+    /// messages in.
     #[must_use]
     pub fn load(&self) -> u64 {
         match self.phase {
@@ -115,7 +112,8 @@ impl BridgeState {
         matches!(self.phase, Phase::Up { .. })
     }
 
-    /// Whether its lane is so far behind, or its peer so silent, that it could not be emptied in passing.
+    /// Whether its lane is so far behind, or its peer so silent, that it could not be emptied in
+    /// passing.
     fn is_behind(&mut self, now: Instant, link: &dyn LaneLink) -> bool {
         let queued = self.lane_id().map_or(0, |lane| link.queued(lane)) + self.pressing;
         let silent = self.receiver().is_some_and(|(_, peer)| link.is_suspect(peer));
@@ -125,24 +123,25 @@ impl BridgeState {
 }
 
 impl TopicPath {
-    /// Whether another flow could go on with what this one carries out of the layer, and no message be lost or sent twice: it is
-    /// known where the next one begins, nothing is kept for late joiners (that would be sent again), no bridge empties its
-    /// queue, and no lane is behind.
+    /// Whether another flow could go on with what this one carries out of the layer, and no message
+    /// be lost or sent twice: it is known where the next one begins, nothing is kept for late
+    /// joiners (that would be sent again), no bridge empties its queue, and no lane is behind.
     fn may_move(&mut self, now: Instant, link: &dyn LaneLink) -> bool {
         let draining = |bridge: &BridgeState| matches!(bridge.phase, Phase::Draining { .. });
         if !self.places.are_exact(MAX_PARTITIONS) || self.bridges.iter().any(draining) {
             return false;
         }
-        let mut lanes = self
-            .bridges
-            .iter_mut()
-            .filter(|bridge| bridge.carries_out() && bridge.is_up());
-        lanes.all(|bridge| !bridge.lane.durable && bridge.load.is_known() && !bridge.is_behind(now, link))
+        let mut lanes =
+            self.bridges.iter_mut().filter(|bridge| bridge.carries_out() && bridge.is_up());
+        lanes.all(|bridge| {
+            !bridge.lane.durable && bridge.load.is_known() && !bridge.is_behind(now, link)
+        })
     }
 }
 
 impl DataCore {
-    /// Takes a sample of what every bridge carries, and tells the whole; to be called once a second.
+    /// Takes a sample of what every bridge carries, and tells the whole; to be called once a
+    /// second.
     pub fn measure(&mut self, now: Instant, link: &dyn LaneLink) -> Loads {
         let mut loads = Loads::default();
         for path in self.topics.iter_mut().filter(|path| !path.vacant) {
@@ -176,7 +175,9 @@ impl DataCore {
         let Some(id) = self.find(topic.as_str()) else {
             return true;
         };
-        let waits = |bridge: &BridgeState| bridge.carries_out() && matches!(bridge.phase, Phase::Draining { .. });
+        let waits = |bridge: &BridgeState| {
+            bridge.carries_out() && matches!(bridge.phase, Phase::Draining { .. })
+        };
         !self.path(id).bridges.iter().any(waits)
     }
 }

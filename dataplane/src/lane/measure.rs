@@ -22,12 +22,7 @@ impl RateMeter {
     /// A meter that has seen nothing.
     #[must_use]
     pub fn new(now: Instant) -> Self {
-        Self {
-            start: now,
-            slots: [(0, 0); SLOTS],
-            second: 0,
-            begun: 0,
-        }
+        Self { start: now, slots: [(0, 0); SLOTS], second: 0, begun: 0 }
     }
 
     /// Counts one message.
@@ -38,22 +33,26 @@ impl RateMeter {
         slot.1 += bytes;
     }
 
-    /// Messages and bytes per second over the last five whole seconds, or over the time since the first second.
+    /// Messages and bytes per second over the last five whole seconds, or over the time since the
+    /// first second.
     pub fn rate(&mut self, now: Instant) -> (f64, f64) {
         self.turn(now);
         let current = (self.second % SLOTS as u64) as usize;
         let whole = (self.second - self.begun).min(WINDOW_S);
         if whole == 0 {
-            let elapsed = now.saturating_duration_since(self.start).as_secs_f64() - self.second as f64;
+            let elapsed =
+                now.saturating_duration_since(self.start).as_secs_f64() - self.second as f64;
             let (messages, bytes) = self.slots[current];
             return (messages as f64 / elapsed.max(0.1), bytes as f64 / elapsed.max(0.1));
         }
         let others = self.slots.iter().enumerate().filter(|(index, _)| *index != current);
-        let (messages, bytes) = others.fold((0, 0), |sum, (_, slot)| (sum.0 + slot.0, sum.1 + slot.1));
+        let (messages, bytes) =
+            others.fold((0, 0), |sum, (_, slot)| (sum.0 + slot.0, sum.1 + slot.1));
         (messages as f64 / whole as f64, bytes as f64 / whole as f64)
     }
 
-    /// Messages per second over the last [`WINDOW`]; `None` while it was not counted for so long, as after a silence.
+    /// Messages per second over the last [`WINDOW`]; `None` while it was not counted for so long,
+    /// as after a silence.
     pub fn of_window(&mut self, now: Instant) -> Option<f64> {
         let hz = self.rate(now).0;
         (self.second - self.begun >= WINDOW_S).then_some(hz)
@@ -66,7 +65,8 @@ impl RateMeter {
         }
         if second - self.second >= SLOTS as u64 {
             self.slots = [(0, 0); SLOTS];
-            // After a silence the mean begins anew, so that a topic that starts again shows its rate at once.
+            // After a silence the mean begins anew, so that a topic that starts again shows its
+            // rate at once.
             self.begun = second;
         } else {
             for passed in self.second + 1..=second {
@@ -90,11 +90,7 @@ pub struct LatencyHistogram {
 
 impl Default for LatencyHistogram {
     fn default() -> Self {
-        Self {
-            counts: Box::new([0; BUCKETS]),
-            count: 0,
-            sum_us: 0,
-        }
+        Self { counts: Box::new([0; BUCKETS]), count: 0, sum_us: 0 }
     }
 }
 
@@ -127,7 +123,8 @@ impl LatencyHistogram {
         self.sum_us
     }
 
-    /// The latency that a part (0 to 1) of them does not exceed, in milliseconds; `None` when nothing was counted.
+    /// The latency that a part (0 to 1) of them does not exceed, in milliseconds; `None` when
+    /// nothing was counted.
     #[must_use]
     pub fn quantile_ms(&self, part: f64) -> Option<f64> {
         if self.count == 0 {
@@ -188,10 +185,7 @@ mod tests {
             meter.add(start + Duration::from_millis(20) * n, 100);
         }
         let (rate, bytes) = meter.rate(start + Duration::from_secs(10));
-        assert!(
-            (rate - 50.0).abs() < 0.1 && (bytes - 5000.0).abs() < 10.0,
-            "{rate} {bytes}"
-        );
+        assert!((rate - 50.0).abs() < 0.1 && (bytes - 5000.0).abs() < 10.0, "{rate} {bytes}");
         assert!(meter.rate(start + Duration::from_secs(60)).0.abs() < f64::EPSILON);
     }
 
@@ -213,11 +207,8 @@ mod tests {
 
     #[test]
     fn histograms_add_up() {
-        let (mut all, mut one, mut other) = (
-            LatencyHistogram::default(),
-            LatencyHistogram::default(),
-            LatencyHistogram::default(),
-        );
+        let (mut all, mut one, mut other) =
+            (LatencyHistogram::default(), LatencyHistogram::default(), LatencyHistogram::default());
         for us in 0..1_000 {
             all.record(us);
             let part = if us % 3 == 0 { &mut one } else { &mut other };

@@ -27,7 +27,8 @@ use crate::plan::{LaneSpec, Target};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TopicId(pub u32);
 
-/// What local advertisements say of a topic: the ground for headers of bare messages and for its class.
+/// What local advertisements say of a topic: the ground for headers of bare messages and for its
+/// class.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TopicInfo {
     /// Those of the node scope.
@@ -116,7 +117,8 @@ impl Refused {
 pub enum Sink {
     /// A local broker.
     Publish {
-        /// Writer of the channel, of this bridge alone; absent while it cannot be made, and when the bridge has ended.
+        /// Writer of the channel, of this bridge alone; absent while it cannot be made, and when
+        /// the bridge has ended.
         writer: Option<Writer>,
         /// Writers that were replaced and have not delivered all yet.
         past: Vec<Writer>,
@@ -205,8 +207,8 @@ impl BridgeState {
         }
     }
 
-    /// Whether it takes messages in now. One from the inter scope does so while it drains, too: a flow that stops says so
-    /// at once, and what it had queued for us comes after.
+    /// Whether it takes messages in now. One from the inter scope does so while it drains, too: a
+    /// flow that stops says so at once, and what it had queued for us comes after.
     #[must_use]
     pub fn takes(&self) -> bool {
         match self.phase {
@@ -256,7 +258,8 @@ impl BridgeState {
 pub struct TopicPath {
     /// Its name.
     pub name: TopicName,
-    /// Another number each time that a topic is given a place, so that bare messages of a topic that was forgotten have another writer.
+    /// Another number each time that a topic is given a place, so that bare messages of a topic
+    /// that was forgotten have another writer.
     pub(super) life: u64,
     /// What local advertisements say of it.
     pub info: TopicInfo,
@@ -367,11 +370,7 @@ impl TopicPath {
     /// Size that decides the class: the largest seen, else as advertised.
     #[must_use]
     pub fn size_bytes(&self) -> u64 {
-        if self.largest_bytes > 0 {
-            self.largest_bytes
-        } else {
-            self.info.max_bytes.unwrap_or(0)
-        }
+        if self.largest_bytes > 0 { self.largest_bytes } else { self.info.max_bytes.unwrap_or(0) }
     }
 
     /// Whether its messages are large, as seen or as advertised.
@@ -393,9 +392,7 @@ impl TopicPath {
     /// Whether messages that come over the link are written somewhere.
     #[must_use]
     pub fn delivers(&self) -> bool {
-        self.bridges
-            .iter()
-            .any(|bridge| bridge.from == Scope::Inter && bridge.takes())
+        self.bridges.iter().any(|bridge| bridge.from == Scope::Inter && bridge.takes())
     }
 
     /// Whether a bridge from that scope takes what was published before it.

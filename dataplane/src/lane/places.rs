@@ -15,7 +15,8 @@ use crate::plan::{Bridge, Target, TopicPlan};
 use crate::world::OriginFilter;
 
 impl DataCore {
-    /// Forgets topics that nobody has used for [`FORGET`]; to be called every few seconds. Returns how many.
+    /// Forgets topics that nobody has used for [`FORGET`]; to be called every few seconds. Returns
+    /// how many.
     pub fn forget_unused(&mut self, now: Instant) -> usize {
         let before = self.vacant.len();
         for (index, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
@@ -29,8 +30,7 @@ impl DataCore {
                 continue;
             }
             self.by_name.remove(&path.name);
-            self.free_lanes
-                .extend(path.bridges.iter().filter_map(BridgeState::lane_id));
+            self.free_lanes.extend(path.bridges.iter().filter_map(BridgeState::lane_id));
             path.bridges = Vec::new();
             path.bare.clear();
             path.vacant = true;
@@ -71,8 +71,9 @@ impl DataCore {
         Some(id)
     }
 
-    /// Makes the bridges of a topic equal to its plan. `writer` gives what writes to a local target, for each bridge one of
-    /// its own, or says why it cannot be made: then the bridge has failed. Bridges that are no longer planned drain.
+    /// Makes the bridges of a topic equal to its plan. `writer` gives what writes to a local
+    /// target, for each bridge one of its own, or says why it cannot be made: then the bridge has
+    /// failed. Bridges that are no longer planned drain.
     pub fn apply(
         &mut self,
         now: Instant,
@@ -84,16 +85,12 @@ impl DataCore {
         let path = &mut self.topics[topic.0 as usize];
         path.info = info;
         for bridge in &mut path.bridges {
-            let planned = plan
-                .bridges
-                .iter()
-                .any(|p| p.from == bridge.from && p.to == bridge.target);
+            let planned =
+                plan.bridges.iter().any(|p| p.from == bridge.from && p.to == bridge.target);
             match bridge.phase {
                 Phase::Up { .. } if !planned => {
-                    bridge.phase = Phase::Draining {
-                        until: now + DRAIN,
-                        latest: now + LONGEST_WAIT,
-                    };
+                    bridge.phase =
+                        Phase::Draining { until: now + DRAIN, latest: now + LONGEST_WAIT };
                     self.draining.insert(topic);
                     if bridge.has_successor(plan) {
                         self.succession.await_written(now, topic, bridge);
@@ -132,7 +129,8 @@ impl DataCore {
         self.lanes_changed = true;
     }
 
-    /// Gives bridges of a topic that have begun what was kept for them. To be called after [`DataCore::apply`].
+    /// Gives bridges of a topic that have begun what was kept for them. To be called after
+    /// [`DataCore::apply`].
     pub(super) fn deliver_kept(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
         let begun = std::mem::take(&mut self.begun);
         let (mine, others): (Vec<_>, Vec<_>) = begun.into_iter().partition(|(of, _)| *of == topic);
@@ -150,7 +148,9 @@ impl DataCore {
                 // The rules may have changed since it came.
                 if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(&message) {
                     let waiting = bridge.pass(now, &message, large, &mut path.gates);
-                    passed.extend(waiting.map(|waiting| (message.frame, ToLanes::from_iter([(at, waiting)]))));
+                    passed.extend(
+                        waiting.map(|waiting| (message.frame, ToLanes::from_iter([(at, waiting)]))),
+                    );
                 }
             }
             for (frame, lanes) in passed {
@@ -168,8 +168,8 @@ impl DataCore {
         }
     }
 
-    /// A writer's lease is over: what is kept of it goes, unless one of `but` says that it is still there. Returns which writers
-    /// that were.
+    /// A writer's lease is over: what is kept of it goes, unless one of `but` says that it is still
+    /// there. Returns which writers that were.
     pub fn forget_writers(
         &mut self,
         now: Instant,
@@ -180,12 +180,12 @@ impl DataCore {
         self.kept.forget(now, topic, of, but)
     }
 
-    /// Writers of earlier lives of their services, since the last call: what brokers keep of them goes, too.
+    /// Writers of earlier lives of their services, since the last call: what brokers keep of them
+    /// goes, too.
     pub fn take_superseded(&mut self) -> Vec<(TopicName, WriterId)> {
         let superseded = std::mem::take(&mut self.kept.superseded);
-        let named = superseded
-            .into_iter()
-            .map(|(topic, writer)| (self.path(topic).name.clone(), writer));
+        let named =
+            superseded.into_iter().map(|(topic, writer)| (self.path(topic).name.clone(), writer));
         named.collect()
     }
 
@@ -213,11 +213,7 @@ impl DataCore {
             }
             target => {
                 self.free_lanes.extend(old_lane);
-                Sink::Publish {
-                    writer: None,
-                    past: Vec::new(),
-                    bare: is_bare(target),
-                }
+                Sink::Publish { writer: None, past: Vec::new(), bare: is_bare(target) }
             }
         };
         let bridge = BridgeState::new(now, planned, sink);

@@ -1,14 +1,16 @@
-//! Compression on the way of a message: after a lane has admitted it and before it is queued, and back after it came over the link.
+//! Compression on the way of a message: after a lane has admitted it and before it is queued, and
+//! back after it came over the link.
 //!
 //! ```text
 //! gate ─► outward: a place in the line of topic and writer ─► begin ─► LZ4 ─► pressed ─► in order ─► lanes
 //! link ─► inward:  a place in the line of topic and writer ─► begin ─► LZ4 ─► pressed ─► in order ─► bridges to brokers
 //! ```
 //!
-//! A message is compressed once, whatever the number of its lanes. What needs no compression waits behind what does of the same writer, so
-//! its order is that of admission. Nothing here runs the codec: whoever owns the data plane offers the [`Turns`] to a pool, and a thread
-//! that has one asks what is to be done then, and comes back with what became of it. Until it asks the message is here, and may give way to a
-//! newer one or become too old.
+//! A message is compressed once, whatever the number of its lanes. What needs no compression waits
+//! behind what does of the same writer, so its order is that of admission. Nothing here runs the
+//! codec: whoever owns the data plane offers the [`Turns`] to a pool, and a thread that has one
+//! asks what is to be done then, and comes back with what became of it. Until it asks the message
+//! is here, and may give way to a newer one or become too old.
 
 mod inward;
 mod level;
@@ -38,12 +40,13 @@ pub(super) use outward::ToLanes;
 pub(super) enum Arrival {
     /// As it was published.
     Live,
-    /// With all that is kept for a late joiner, before anything of it can be compressed. What the codec has no room for goes as it is: nobody
-    /// sends it again.
+    /// With all that is kept for a late joiner, before anything of it can be compressed. What the
+    /// codec has no room for goes as it is: nobody sends it again.
     Kept,
 }
 
-/// Of what came over the link so many bytes wait for the pool (16 MiB) before the thread that brings more does the work itself.
+/// Of what came over the link so many bytes wait for the pool (16 MiB) before the thread that
+/// brings more does the work itself.
 const OWN_ABOVE: usize = 16 * 1024 * 1024;
 
 /// Topic and writer: what stays in order.
@@ -139,10 +142,7 @@ impl Default for Press {
             rules: CompressionRules::default(),
             out: InOrder::new(bounds),
             // It was let in by its sender's pacer, and is quickly done.
-            into: InOrder::new(Bounds {
-                waiting_of_one: bounds.bytes_of_one,
-                ..bounds
-            }),
+            into: InOrder::new(Bounds { waiting_of_one: bounds.bytes_of_one, ..bounds }),
             asked: [0; Urgency::ALL.len()],
             was_inward: false,
             refused: 0,
@@ -170,7 +170,8 @@ impl Press {
         self.out.holds(&topic) || self.into.holds(&topic)
     }
 
-    /// What it holds for one bridge of a topic goes to another one. Returns how many messages that are.
+    /// What it holds for one bridge of a topic goes to another one. Returns how many messages that
+    /// are.
     pub(super) fn hand_over(&mut self, topic: TopicId, from: usize, to: usize) -> u64 {
         let mut moved = 0;
         for lanes in self.out.items_mut(&topic).map(|out| &mut out.lanes) {
@@ -186,9 +187,11 @@ impl Press {
         self.out.waits(urgency).items + self.into.waits(urgency).items
     }
 
-    /// Turns that are still to be asked for. One whose message gave way is left to the message that follows.
+    /// Turns that are still to be asked for. One whose message gave way is left to the message that
+    /// follows.
     fn missing(&self) -> [usize; Urgency::ALL.len()] {
-        Urgency::ALL.map(|urgency| self.waiting(urgency).saturating_sub(self.asked[urgency as usize]))
+        Urgency::ALL
+            .map(|urgency| self.waiting(urgency).saturating_sub(self.asked[urgency as usize]))
     }
 
     fn turn_begins(&mut self, urgency: Urgency) {
@@ -210,7 +213,8 @@ impl Press {
 }
 
 impl DataCore {
-    /// There is a pool: payloads are compressed from now on. Without this they go as they are, and what comes is decompressed at once.
+    /// There is a pool: payloads are compressed from now on. Without this they go as they are, and
+    /// what comes is decompressed at once.
     pub fn enable_compression(&mut self) {
         self.press.enabled = true;
     }
@@ -251,11 +255,7 @@ impl DataCore {
         press.asked[Urgency::Long as usize] += long;
         let is_behind = press.into.waits(Urgency::Quick).bytes > OWN_ABOVE;
         let own = if is_behind { quick } else { 0 };
-        Turns {
-            quick: quick - own,
-            long,
-            own,
-        }
+        Turns { quick: quick - own, long, own }
     }
 
     /// Whether there are turns to be offered.
@@ -265,7 +265,12 @@ impl DataCore {
     }
 
     /// A thread of the pool has a turn. `None`: nothing is left to be done.
-    pub fn begin(&mut self, now: Instant, urgency: Urgency, link: &mut dyn LaneLink) -> Option<PressJob> {
+    pub fn begin(
+        &mut self,
+        now: Instant,
+        urgency: Urgency,
+        link: &mut dyn LaneLink,
+    ) -> Option<PressJob> {
         self.press.turn_begins(urgency);
         if urgency == Urgency::Quick
             && !self.press.was_inward
@@ -280,14 +285,21 @@ impl DataCore {
         })
     }
 
-    /// The calling thread has a turn of its own, for what came over the link. `None`: nothing is left to be done.
+    /// The calling thread has a turn of its own, for what came over the link. `None`: nothing is
+    /// left to be done.
     pub fn begin_own(&mut self) -> Option<PressJob> {
         self.press.turn_begins(Urgency::Quick);
         self.press.begin_inward()
     }
 
     /// Takes what became of a message.
-    pub fn pressed(&mut self, now: Instant, ticket: PressTicket, done: Done, link: &mut dyn LaneLink) {
+    pub fn pressed(
+        &mut self,
+        now: Instant,
+        ticket: PressTicket,
+        done: Done,
+        link: &mut dyn LaneLink,
+    ) {
         self.press.failed += u64::from(done == Done::Failed);
         if ticket.outward {
             self.pressed_out(now, &ticket.place, done, link);
@@ -323,7 +335,8 @@ impl DataCore {
     #[must_use]
     pub fn press_counters(&self) -> PressCounters {
         let press = &self.press;
-        let waits = Urgency::ALL.map(|urgency| press.out.waits(urgency).bytes + press.into.waits(urgency).bytes);
+        let waits = Urgency::ALL
+            .map(|urgency| press.out.waits(urgency).bytes + press.into.waits(urgency).bytes);
         PressCounters {
             waiting: Urgency::ALL.iter().map(|urgency| press.waiting(*urgency)).sum(),
             waiting_bytes: waits.iter().sum(),

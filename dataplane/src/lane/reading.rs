@@ -1,8 +1,9 @@
 //! Where a topic is read on a layer broker that keeps messages in places, by partition.
 //!
-//! A flow that comes to carry a topic out of the layer begins where the one before it has stopped. If it reads the topic for
-//! its own node already, that place lies before or behind: what lies before is read once more, for the bridges out of the layer
-//! alone, and what lies between is not for them.
+//! A flow that comes to carry a topic out of the layer begins where the one before it has stopped.
+//! If it reads the topic for its own node already, that place lies before or behind: what lies
+//! before is read once more, for the bridges out of the layer alone, and what lies between is not
+//! for them.
 
 use std::sync::Arc;
 
@@ -15,18 +16,18 @@ use super::path::TopicId;
 /// Places of one topic.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Places {
-    /// Offset of the next message, of all partitions; empty while it is not known where reading began. Partitions that the topic
-    /// gets later are read from their beginning.
+    /// Offset of the next message, of all partitions; empty while it is not known where reading
+    /// began. Partitions that the topic gets later are read from their beginning.
     next: Vec<i64>,
     /// What lies before is not for bridges out of the layer.
     carried_from: Vec<i64>,
     /// What lies before is for bridges out of the layer alone: the others had it.
     again_until: Vec<i64>,
-    /// Where bridges out of the layer are to begin. What the subscription that is to be replaced still reads is not for them: they
-    /// get it with the next one.
+    /// Where bridges out of the layer are to begin. What the subscription that is to be replaced
+    /// still reads is not for them: they get it with the next one.
     takes: Option<Begin>,
-    /// The same, from the attempt to subscribe there until the subscription stands: one that is replaced before has read nothing,
-    /// and the next one begins there.
+    /// The same, from the attempt to subscribe there until the subscription stands: one that is
+    /// replaced before has read nothing, and the next one begins there.
     taking: Option<Begin>,
 }
 
@@ -61,7 +62,8 @@ impl Places {
                 self.next.resize(partition + 1, 0);
             }
             if offset < self.next[partition] {
-                // A subscription only goes on: the topic was made anew, and nobody had anything of it.
+                // A subscription only goes on: the topic was made anew, and nobody had anything of
+                // it.
                 self.carried_from.clear();
                 self.again_until.clear();
             }
@@ -78,7 +80,8 @@ impl Places {
         }
     }
 
-    /// Whether it is known of every partition where the next one begins, and they are few enough to be told.
+    /// Whether it is known of every partition where the next one begins, and they are few enough to
+    /// be told.
     pub(super) fn are_exact(&self, most: usize) -> bool {
         self.pending().is_none() && (1..=most).contains(&self.next.len())
     }
@@ -91,7 +94,8 @@ impl Places {
     /// Where the one that comes next begins; empty where nothing is known of it.
     fn stopped_at(&self) -> Vec<i64> {
         match self.pending() {
-            // Nothing was carried from there yet; further partitions were to begin where they stand.
+            // Nothing was carried from there yet; further partitions were to begin where they
+            // stand.
             Some(Begin::At(offsets)) => {
                 let further = self.next.iter().skip(offsets.len());
                 offsets.iter().chain(further).copied().collect()
@@ -99,7 +103,9 @@ impl Places {
             // It is a time, which no one can be told.
             Some(Begin::Since { .. }) => Vec::new(),
             Some(Begin::Now) | None => {
-                let stands = |(partition, next): (usize, &i64)| (*next).max(at(&self.carried_from, partition));
+                let stands = |(partition, next): (usize, &i64)| {
+                    (*next).max(at(&self.carried_from, partition))
+                };
                 self.next.iter().enumerate().map(stands).collect()
             }
         }
@@ -131,10 +137,7 @@ impl Places {
             Some(Begin::Since { appended_ms, .. }) => {
                 self.carried_from.clear();
                 self.again_until = held.to_vec();
-                Begin::Since {
-                    appended_ms: *appended_ms,
-                    latest: held,
-                }
+                Begin::Since { appended_ms: *appended_ms, latest: held }
             }
             Some(Begin::Now) | None if held.is_empty() => {
                 self.again_until.clear();
@@ -155,7 +158,8 @@ impl Places {
 const MAX_PARTITIONS: usize = 4096;
 
 impl DataCore {
-    /// The bridges out of the layer that a topic got now begin there, as soon as its layer scope is subscribed anew.
+    /// The bridges out of the layer that a topic got now begin there, as soon as its layer scope is
+    /// subscribed anew.
     pub fn takes_over(&mut self, topic: TopicId, begin: &Begin) {
         let path = self.path_mut(topic);
         if path.reads(Scope::Layer) && *begin != Begin::Now {
@@ -163,17 +167,20 @@ impl DataCore {
         }
     }
 
-    /// Where the layer scope is to be subscribed for a topic. `again`: another subscription was read until now.
+    /// Where the layer scope is to be subscribed for a topic. `again`: another subscription was
+    /// read until now.
     pub fn begin_reading(&mut self, topic: TopicId, again: bool) -> Begin {
         self.path_mut(topic).places.begin(again)
     }
 
-    /// The layer scope is subscribed for a topic, from these offsets on; none where its broker has no places.
+    /// The layer scope is subscribed for a topic, from these offsets on; none where its broker has
+    /// no places.
     pub fn reads_from(&mut self, topic: TopicId, starts: &[i64]) {
         self.path_mut(topic).places.stands(starts);
     }
 
-    /// Where the flow stands that carries a topic out of the layer next begins; empty where the broker has no places.
+    /// Where the flow stands that carries a topic out of the layer next begins; empty where the
+    /// broker has no places.
     #[must_use]
     pub fn stopped_at(&self, topic: TopicId) -> Vec<i64> {
         self.path(topic).places.stopped_at()
@@ -192,11 +199,7 @@ mod tests {
     use super::*;
 
     fn place_in(partition: usize, offset: i64) -> Option<Place> {
-        Some(Place {
-            partition,
-            offset,
-            appended_ms: None,
-        })
+        Some(Place { partition, offset, appended_ms: None })
     }
 
     fn place(offset: i64) -> Option<Place> {
@@ -208,10 +211,7 @@ mod tests {
     }
 
     fn since(latest: &[i64]) -> Begin {
-        Begin::Since {
-            appended_ms: 5,
-            latest: latest.into(),
-        }
+        Begin::Since { appended_ms: 5, latest: latest.into() }
     }
 
     /// One partition, read until there.
@@ -243,11 +243,7 @@ mod tests {
         let mut places = Places::default();
         places.take_over(&at_0(7));
         assert_eq!(places.begin(false), at_0(7));
-        assert_eq!(
-            places.stopped_at(),
-            [7],
-            "nothing was read yet: the next one begins there too"
-        );
+        assert_eq!(places.stopped_at(), [7], "nothing was read yet: the next one begins there too");
         places.stands(&[7]);
         assert_eq!(places.read([7]), [For::All]);
         assert_eq!(places.stopped_at(), [8]);
@@ -257,10 +253,7 @@ mod tests {
     fn what_was_read_before_is_read_again_for_the_bridges_out_of_the_layer_alone() {
         let mut places = read_until(10);
         assert_eq!(places.takes(&at_0(7)), at_0(7));
-        assert_eq!(
-            places.read([7, 9, 10, 11]),
-            [For::Outside, For::Outside, For::All, For::All]
-        );
+        assert_eq!(places.read([7, 9, 10, 11]), [For::Outside, For::Outside, For::All, For::All]);
     }
 
     #[test]
@@ -268,10 +261,7 @@ mod tests {
         let mut places = read_until(5);
         assert_eq!(places.takes(&at_0(7)), at_0(5));
         assert_eq!(places.stopped_at(), [7]);
-        assert_eq!(
-            places.read([5, 6, 7, 8]),
-            [For::Inside, For::Inside, For::All, For::All]
-        );
+        assert_eq!(places.read([5, 6, 7, 8]), [For::Inside, For::Inside, For::All, For::All]);
     }
 
     #[test]
@@ -279,10 +269,7 @@ mod tests {
         assert_eq!(Places::default().takes(&since(&[])), since(&[]));
         let mut places = read_until(10);
         assert_eq!(places.takes(&since(&[])), since(&[10]));
-        assert!(
-            !places.are_exact(8) && places.stopped_at().is_empty(),
-            "found out by the server"
-        );
+        assert!(!places.are_exact(8) && places.stopped_at().is_empty(), "found out by the server");
         places.stands(&[8]);
         assert_eq!(places.read([8, 10]), [For::Outside, For::All]);
     }
@@ -311,7 +298,9 @@ mod tests {
             places.stands(&[7]);
             assert_eq!(places.begin(true), at_0(7), "from now on it goes on where it is");
         }
-        for (takes, begins) in [(at_0(7), at_0(7)), (at_0(12), at_0(10)), (since(&[]), since(&[10]))] {
+        for (takes, begins) in
+            [(at_0(7), at_0(7)), (at_0(12), at_0(10)), (since(&[]), since(&[10]))]
+        {
             let mut places = read_until(10);
             places.take_over(&takes);
             assert_eq!(places.begin(true), begins);

@@ -1,5 +1,6 @@
-//! Counters of one bridge. For each of them `in = out + Σ dropped + queued` holds at any time; what brokers' adapters did since
-//! is in them after [`BridgeState::settle`](super::path::BridgeState::settle).
+//! Counters of one bridge. For each of them `in = out + Σ dropped + queued` holds at any time; what
+//! brokers' adapters did since is in them after
+//! [`BridgeState::settle`](super::path::BridgeState::settle).
 
 use blaze_domain::DropReason;
 
@@ -95,11 +96,13 @@ pub struct Lately {
 pub struct BridgeStats {
     /// Taken in.
     pub taken: Count,
-    /// Written to the destination: the broker's server has it; on the link of reliable or chunked messages: acknowledged.
+    /// Written to the destination: the broker's server has it; on the link of reliable or chunked
+    /// messages: acknowledged.
     pub out: Count,
     /// Dropped, by reason.
     pub dropped: Drops,
-    /// Time that the messages spent in this flow until they were written; on the link until their last byte was sent.
+    /// Time that the messages spent in this flow until they were written; on the link until their
+    /// last byte was sent.
     pub latency: LatencyHistogram,
     marks: [Mark; 2],
 }
@@ -129,9 +132,6 @@ impl BridgeStats {
     /// Messages that are inside: taken in, neither written nor dropped.
     #[must_use]
     pub fn queued(&self) -> u64 {
-        self.taken
-            .messages
-            .saturating_sub(self.out.messages)
-            .saturating_sub(self.dropped.total())
+        self.taken.messages.saturating_sub(self.out.messages).saturating_sub(self.dropped.total())
     }
 }

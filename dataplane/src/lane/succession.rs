@@ -1,13 +1,15 @@
-//! A topic goes from one receiver of a layer to another: what comes after is not written before what came first.
+//! A topic goes from one receiver of a layer to another: what comes after is not written before
+//! what came first.
 //!
 //! ```text
 //! plan: A ─► B    A: takes nothing more, empties its lane ─► asks A "written?" ─► A: yes ─► ended
 //!                 B: holds what comes, in order                                             └─► B sends it, and goes on
 //! ```
 //!
-//! An acknowledgement says that A has a message, not that A's broker has it: where that stands still, messages wait with A, and
-//! those that B gets meanwhile would be written at the same time. So A is asked, and says yes when all that it had is with its
-//! brokers. It is not waited for when it is gone, and not for ever; and a flow that goes away itself waits for nobody.
+//! An acknowledgement says that A has a message, not that A's broker has it: where that stands
+//! still, messages wait with A, and those that B gets meanwhile would be written at the same time.
+//! So A is asked, and says yes when all that it had is with its brokers. It is not waited for when
+//! it is gone, and not for ever; and a flow that goes away itself waits for nobody.
 //!
 //! A and B write to one broker: only bridges to flows that share theirs follow one another.
 
@@ -24,7 +26,8 @@ use super::places::topic_id;
 use super::writer::NewWriter;
 use crate::plan::{LaneSpec, Target, TopicPlan};
 
-/// After which a flow is asked again, because question or answer may have been lost; doubled each time …
+/// After which a flow is asked again, because question or answer may have been lost; doubled each
+/// time …
 const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// … up to this.
 const ASK_LATER: Duration = Duration::from_secs(1);
@@ -34,7 +37,8 @@ pub(super) const MAX_ASKS: usize = 32;
 const ASK_NEXT: Duration = Duration::from_millis(20);
 /// How long the one before is waited for at most.
 pub(super) const LONGEST_WAIT: Duration = Duration::from_secs(10);
-/// A message that has waited for this long goes on even where the queue to the next receiver has no room for all of it.
+/// A message that has waited for this long goes on even where the queue to the next receiver has no
+/// room for all of it.
 pub(super) const LONGEST_PATIENCE: Duration = Duration::from_secs(20);
 /// Bytes that are held at most, of all topics (32 MiB); one message always fits.
 const MAX_HELD_BYTES: usize = 32 * 1024 * 1024;
@@ -46,7 +50,8 @@ const MAX_QUESTIONS: usize = 1_024;
 const MAX_QUESTIONS_OF_ONE: usize = 256;
 /// … and for one topic, of which a flow may have several lanes.
 const MAX_QUESTIONS_OF_TOPIC: usize = 4;
-/// How often it is looked whether a question can be answered. Brokers do not tell when they have taken a message.
+/// How often it is looked whether a question can be answered. Brokers do not tell when they have
+/// taken a message.
 const LOOK: Duration = Duration::from_millis(5);
 /// … and that of one who has waited for a second.
 const LOOK_LATER: Duration = Duration::from_millis(50);
@@ -104,7 +109,8 @@ struct Question {
     topic: String,
     token: u64,
     since: Instant,
-    /// Bridges that wrote what had come by then, by place. Unknown while messages of the topic wait for their bridge.
+    /// Bridges that wrote what had come by then, by place. Unknown while messages of the topic wait
+    /// for their bridge.
     marks: Option<Vec<(usize, Mark)>>,
 }
 
@@ -125,7 +131,8 @@ pub(super) struct Succession {
 }
 
 impl Succession {
-    /// What the receiver of a bridge that drains has got is to be written before another one goes on.
+    /// What the receiver of a bridge that drains has got is to be written before another one goes
+    /// on.
     pub(super) fn await_written(&mut self, now: Instant, topic: TopicId, bridge: &mut BridgeState) {
         // What is with the codec will be given to its lane.
         let was_used = bridge.submitted || bridge.pressing > 0;
@@ -167,8 +174,8 @@ impl BridgeState {
         matches!(self.phase, Phase::Draining { .. })
     }
 
-    /// Whether another bridge goes on with what this one has sent: to a replica of its receiver, or that of another flow out of this
-    /// layer.
+    /// Whether another bridge goes on with what this one has sent: to a replica of its receiver, or
+    /// that of another flow out of this layer.
     pub(super) fn has_successor(&self, plan: &TopicPlan) -> bool {
         let here = plan.bridges.iter().any(|planned| {
             planned.from == self.from
@@ -202,7 +209,8 @@ impl BridgeState {
         if message.large && keep > 0 {
             let writer = message.frame.writer();
             let is_older = |other: &Waiting| other.large && other.frame.writer() == writer;
-            let mut surplus = (held.iter().filter(|other| is_older(other)).count() + 1).saturating_sub(keep);
+            let mut surplus =
+                (held.iter().filter(|other| is_older(other)).count() + 1).saturating_sub(keep);
             held.retain(|other| {
                 let goes = surplus > 0 && is_older(other);
                 if goes {
@@ -221,7 +229,8 @@ impl BridgeState {
         }
     }
 
-    /// Empties a bridge that drains, and ends it when nothing of it is left. Returns when it is to be looked at again.
+    /// Empties a bridge that drains, and ends it when nothing of it is left. Returns when it is to
+    /// be looked at again.
     pub(super) fn empty(
         &mut self,
         now: Instant,
@@ -239,7 +248,8 @@ impl BridgeState {
             Some(lane) => link.queued(lane) + self.pressing,
             None => self.settle(),
         };
-        // What a bridge from the inter scope has to empty is on its way to it: it stays until the end.
+        // What a bridge from the inter scope has to empty is on its way to it: it stays until the
+        // end.
         let empty = self.from != Scope::Inter && queued == 0 && self.held.is_none();
         if !empty && now < until {
             // Brokers do not tell when they have taken a message.
@@ -281,7 +291,8 @@ impl BridgeState {
         link: &mut dyn LaneLink,
     ) -> Option<Instant> {
         let until = self.waits_for_answer(now, link)?;
-        let (Target::Inter { receiver, .. }, Some(unwritten)) = (&self.target, &mut self.unwritten) else {
+        let (Target::Inter { receiver, .. }, Some(unwritten)) = (&self.target, &mut self.unwritten)
+        else {
             return None;
         };
         if unwritten.ask_at.is_none_or(|at| at <= now) {
@@ -302,7 +313,9 @@ impl BridgeState {
     /// Its writer, and how many messages that has taken.
     fn mark(&self) -> Mark {
         match &self.sink {
-            Sink::Publish { writer, .. } => writer.as_ref().map(|writer| (writer.made().clone(), writer.taken())),
+            Sink::Publish { writer, .. } => {
+                writer.as_ref().map(|writer| (writer.made().clone(), writer.taken()))
+            }
             Sink::Lane { .. } => None,
         }
     }
@@ -324,12 +337,11 @@ impl BridgeState {
         }
         match (&self.sink, mark) {
             (Sink::Publish { past, .. }, _) if !past.is_empty() => false,
-            (
-                Sink::Publish {
-                    writer: Some(writer), ..
-                },
-                Some((made, taken)),
-            ) if writer.is(made) => writer.taken() - writer.queued().min(writer.taken()) >= *taken,
+            (Sink::Publish { writer: Some(writer), .. }, Some((made, taken)))
+                if writer.is(made) =>
+            {
+                writer.taken() - writer.queued().min(writer.taken()) >= *taken
+            }
             // What it had then has been replaced, and has delivered all.
             _ => true,
         }
@@ -347,7 +359,8 @@ impl DataCore {
         let mut waits = false;
         for other in before.iter_mut().chain(after) {
             // The plan that ended it may have come a moment before the one that says who goes on.
-            let just_ended = other.ended.is_some_and(|at| now.saturating_duration_since(at) < DRAIN);
+            let just_ended =
+                other.ended.is_some_and(|at| now.saturating_duration_since(at) < DRAIN);
             if !(other.is_draining() || just_ended) || !other.is_beside(own) {
                 continue;
             }
@@ -355,13 +368,8 @@ impl DataCore {
             if other.unwritten.is_some() {
                 waits = true;
                 if just_ended {
-                    (other.phase, other.ended) = (
-                        Phase::Draining {
-                            until: now,
-                            latest: now,
-                        },
-                        None,
-                    );
+                    (other.phase, other.ended) =
+                        (Phase::Draining { until: now, latest: now }, None);
                     self.draining.insert(topic);
                 }
             }
@@ -371,16 +379,17 @@ impl DataCore {
         }
     }
 
-    /// What bridges held that are not planned any more goes to those that go on. Where nobody does it stays with them, until they
-    /// are planned again or have drained.
+    /// What bridges held that are not planned any more goes to those that go on. Where nobody does
+    /// it stays with them, until they are planned again or have drained.
     pub(super) fn pass_on(&mut self, topic: TopicId) {
         let bridges = &mut self.topics[topic.0 as usize].bridges;
         for at in 0..bridges.len() {
             if bridges[at].held.is_none() || !bridges[at].is_draining() {
                 continue;
             }
-            let goes_on =
-                |bridge: &BridgeState| matches!(bridge.phase, Phase::Up { .. }) && bridge.is_beside(&bridges[at]);
+            let goes_on = |bridge: &BridgeState| {
+                matches!(bridge.phase, Phase::Up { .. }) && bridge.is_beside(&bridges[at])
+            };
             if let Some(heir) = bridges.iter().position(goes_on) {
                 let mut held = bridges[at].held.take().unwrap_or_default();
                 held.append(bridges[heir].held.take());
@@ -398,14 +407,23 @@ impl DataCore {
         }
     }
 
-    /// Sends what bridges of a topic held for those before them, which have ended. Returns when to look again, if there was no room
-    /// for all of it.
-    pub(super) fn release(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) -> Option<Instant> {
+    /// Sends what bridges of a topic held for those before them, which have ended. Returns when to
+    /// look again, if there was no room for all of it.
+    pub(super) fn release(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        link: &mut dyn LaneLink,
+    ) -> Option<Instant> {
         let bridges = &mut self.topics[topic.0 as usize].bridges;
         let mut again = None;
         for at in 0..bridges.len() {
-            let waits = bridges[at].lane.held && !bridges[at].is_draining() && !self.succession.leaving;
-            if waits || bridges[at].held.is_none() || bridges.iter().any(|other| other.comes_before(&bridges[at])) {
+            let waits =
+                bridges[at].lane.held && !bridges[at].is_draining() && !self.succession.leaving;
+            if waits
+                || bridges[at].held.is_none()
+                || bridges.iter().any(|other| other.comes_before(&bridges[at]))
+            {
                 continue;
             }
             let bridge = &mut bridges[at];
@@ -451,15 +469,22 @@ impl DataCore {
             return true;
         }
         let bridges = self.topics.iter_mut().flat_map(|topic| &mut topic.bridges);
-        bridges
-            .filter(|bridge| bridge.from == Scope::Inter)
-            .any(|bridge| bridge.settle() > 0)
+        bridges.filter(|bridge| bridge.from == Scope::Inter).any(|bridge| bridge.settle() > 0)
     }
 
-    /// A flow asks whether all that it has sent of a topic is written. It is answered as soon as that is so.
-    pub fn written_asked(&mut self, now: Instant, from: FlowId, topic: String, token: u64, link: &mut dyn LaneLink) {
+    /// A flow asks whether all that it has sent of a topic is written. It is answered as soon as
+    /// that is so.
+    pub fn written_asked(
+        &mut self,
+        now: Instant,
+        from: FlowId,
+        topic: String,
+        token: u64,
+        link: &mut dyn LaneLink,
+    ) {
         let questions = &mut self.succession.questions;
-        let is_known = |other: &Question| other.token == token && other.from == from && other.topic == topic;
+        let is_known =
+            |other: &Question| other.token == token && other.from == from && other.topic == topic;
         if questions.iter().any(is_known) {
             return;
         }
@@ -474,13 +499,7 @@ impl DataCore {
             questions.remove(oldest);
         }
         let of_one = questions.iter().filter(|other| other.from == from).count();
-        let mut question = Question {
-            from,
-            topic,
-            token,
-            since: now,
-            marks: None,
-        };
+        let mut question = Question { from, topic, token, since: now, marks: None };
         if self.is_written(&mut question) {
             link.tell(&question.from, Body::Written(Written { token }));
         } else if self.succession.questions.len() < MAX_QUESTIONS && of_one < MAX_QUESTIONS_OF_ONE {
@@ -491,15 +510,11 @@ impl DataCore {
 
     /// A flow says that it has written all that was asked for.
     pub fn written(&mut self, from: &FlowId, token: u64) {
-        let topic = usize::try_from(token >> 32)
-            .ok()
-            .and_then(|index| self.topics.get_mut(index));
+        let topic = usize::try_from(token >> 32).ok().and_then(|index| self.topics.get_mut(index));
         for bridge in topic.into_iter().flat_map(|topic| &mut topic.bridges) {
             let asked = bridge.receiver().is_some_and(|(_, receiver)| receiver == from);
-            if let Some(unwritten) = bridge
-                .unwritten
-                .as_mut()
-                .filter(|unwritten| asked && unwritten.token == token)
+            if let Some(unwritten) =
+                bridge.unwritten.as_mut().filter(|unwritten| asked && unwritten.token == token)
             {
                 unwritten.answered = true;
                 self.stirred = true;
@@ -511,7 +526,9 @@ impl DataCore {
     pub(super) fn answer(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
         let mut questions = std::mem::take(&mut self.succession.questions);
         questions.retain_mut(|question| {
-            if now.saturating_duration_since(question.since) >= LONGEST_WAIT || !link.answers(&question.from) {
+            if now.saturating_duration_since(question.since) >= LONGEST_WAIT
+                || !link.answers(&question.from)
+            {
                 return false;
             }
             let written = self.is_written(question);
@@ -540,16 +557,12 @@ impl DataCore {
         }
         let bridges = &mut self.topics[topic.0 as usize].bridges;
         let marks = question.marks.get_or_insert_with(|| {
-            let writes = bridges
-                .iter()
-                .enumerate()
-                .filter(|(_, bridge)| bridge.from == Scope::Inter);
+            let writes =
+                bridges.iter().enumerate().filter(|(_, bridge)| bridge.from == Scope::Inter);
             writes.map(|(at, bridge)| (at, bridge.mark())).collect()
         });
         marks.retain(|(at, mark)| {
-            bridges
-                .get_mut(*at)
-                .is_some_and(|bridge| !bridge.has_written(mark.as_ref()))
+            bridges.get_mut(*at).is_some_and(|bridge| !bridge.has_written(mark.as_ref()))
         });
         marks.is_empty()
     }

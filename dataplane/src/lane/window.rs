@@ -25,7 +25,8 @@ impl DuplicateWindow {
         true
     }
 
-    /// As [`DuplicateWindow::insert`], but what is older than the newest that was noted is not new, seen or not.
+    /// As [`DuplicateWindow::insert`], but what is older than the newest that was noted is not new,
+    /// seen or not.
     pub fn insert_newer(&mut self, sequence: u64) -> bool {
         sequence > self.highest && self.insert(sequence)
     }
@@ -61,14 +62,24 @@ mod tests {
 
     proptest! {
         #[test]
-        fn within_the_window_it_is_a_set(steps in proptest::collection::vec((0u64..1500, any::<bool>()), 1..400)) {
+        fn within_the_window_it_is_a_set(steps in proptest::collection::vec((0u64..1500,
+            any::<bool>()), 1..400)) {
             let mut window = DuplicateWindow::default();
             let mut seen = HashSet::new();
             let mut highest = 0u64;
             for (step, forward) in steps {
-                let sequence = if forward { highest + step + 1 } else { highest.saturating_sub(step).max(1) };
-                let expected = sequence > highest || (highest - sequence < WINDOW && !seen.contains(&sequence));
-                prop_assert_eq!(window.insert(sequence), expected, "{} after {}", sequence, highest);
+                let sequence =
+                    if forward { highest + step + 1 } else { highest.saturating_sub(step).max(1) };
+                let expected =
+                    sequence > highest
+                    || (highest - sequence < WINDOW && !seen.contains(&sequence));
+                prop_assert_eq!(
+                    window.insert(sequence),
+                    expected,
+                    "{} after {}",
+                    sequence,
+                    highest,
+                );
                 seen.insert(sequence);
                 highest = highest.max(sequence);
             }
@@ -78,15 +89,9 @@ mod tests {
     #[test]
     fn what_is_older_than_the_newest_is_not_newer() {
         let mut window = DuplicateWindow::default();
-        for (sequence, new) in [
-            (8, true),
-            (9, true),
-            (7, false),
-            (11, true),
-            (10, false),
-            (11, false),
-            (12, true),
-        ] {
+        for (sequence, new) in
+            [(8, true), (9, true), (7, false), (11, true), (10, false), (11, false), (12, true)]
+        {
             assert_eq!(window.insert_newer(sequence), new, "{sequence}");
         }
         assert!(window.insert(10) && !window.insert(12));

@@ -1,7 +1,8 @@
 //! The writer of one bridge, and what became of the messages that it took.
 //!
-//! A broker's adapter takes a message and may drop it later: its time is over, the server refuses it, newer ones need the
-//! room. So what was handed over is `out` only when it is neither queued nor dropped any more.
+//! A broker's adapter takes a message and may drop it later: its time is over, the server refuses
+//! it, newer ones need the room. So what was handed over is `out` only when it is neither queued
+//! nor dropped any more.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -35,13 +36,7 @@ pub struct Writer {
 
 impl Writer {
     pub(super) fn new(made: NewWriter) -> Self {
-        Self {
-            made,
-            taken: 0,
-            out: 0,
-            lost: Later::default(),
-            pending: Count::default(),
-        }
+        Self { made, taken: 0, out: 0, lost: Later::default(), pending: Count::default() }
     }
 
     /// The publisher and its options.
@@ -66,7 +61,12 @@ impl Writer {
         self.made.publisher.later().queued
     }
 
-    pub(super) fn publish(&mut self, frame: &Frame, bare: bool, deadline: Option<Instant>) -> PublishOutcome {
+    pub(super) fn publish(
+        &mut self,
+        frame: &Frame,
+        bare: bool,
+        deadline: Option<Instant>,
+    ) -> PublishOutcome {
         let payload = frame.payload();
         let outcome = if bare {
             self.made.publisher.publish_bare(payload, deadline)
@@ -83,14 +83,15 @@ impl Writer {
     /// Brings the counters up to date. Returns how many still wait.
     pub(super) fn settle(&mut self, stats: &mut BridgeStats) -> u64 {
         let later = self.made.publisher.later();
-        for ((reason, now), (_, before)) in later.by_reason().into_iter().zip(self.lost.by_reason()) {
+        for ((reason, now), (_, before)) in later.by_reason().into_iter().zip(self.lost.by_reason())
+        {
             let lost = now.saturating_sub(before);
             stats.dropped.add(reason, lost);
             self.take_pending(lost);
         }
         self.lost = later;
-        // The adapter's counters are read one after the other: for a moment a message may seem to be both queued and
-        // dropped. It is out when it is out, never before, and never comes back.
+        // The adapter's counters are read one after the other: for a moment a message may seem to
+        // be both queued and dropped. It is out when it is out, never before, and never comes back.
         let out = self.taken.saturating_sub(later.dropped() + later.queued);
         let more = out.saturating_sub(self.out);
         self.out += more;
@@ -116,10 +117,8 @@ impl Writer {
             let share = u128::from(all.bytes) * u128::from(messages) / u128::from(all.messages);
             u64::try_from(share).unwrap_or(all.bytes)
         };
-        self.pending = Count {
-            messages: all.messages.saturating_sub(messages),
-            bytes: all.bytes - bytes,
-        };
+        self.pending =
+            Count { messages: all.messages.saturating_sub(messages), bytes: all.bytes - bytes };
         bytes
     }
 }

@@ -12,15 +12,19 @@
 //! | `r_min` | [`Terms::min_rate_hz`] | below it no large topic is thinned |
 //! | `r_lane` | [`Lane::max_rate_hz`] | what the requesters of one destination ask for at most |
 //!
-//! A topic of rate `r` costs `Σ over its lanes of min(r, r_lane) · s · α`, because each destination gets a copy. Everything below
-//! follows from "the largest `r` whose cost stays within so many bytes per second", `Demand::rate_for`.
+//! A topic of rate `r` costs `Σ over its lanes of min(r, r_lane) · s · α`, because each destination
+//! gets a copy. Everything below follows from "the largest `r` whose cost stays within so many
+//! bytes per second", `Demand::rate_for`.
 //!
-//! 1. Standard topics (`s ≤ large_bytes`), largest demand `D = r_adv · s · α` first: `min(B_remaining, β·B_avail)`. If they alone exceed the
-//!    budget, smallest demand first: a large one does not starve a stop signal.
-//! 2. Large topics, in the same order, each `max(floor, min(B_i, β·B_avail))`, where `B_i` is what remains less the floors of those after it.
-//!    With [`Sharing::Fair`] they share what remains by max-min fairness in bytes per second instead.
+//! 1. Standard topics (`s ≤ large_bytes`), largest demand `D = r_adv · s · α` first:
+//!    `min(B_remaining, β·B_avail)`. If they alone exceed the budget, smallest demand first: a
+//!    large one does not starve a stop signal.
+//! 2. Large topics, in the same order, each `max(floor, min(B_i, β·B_avail))`, where `B_i` is what
+//!    remains less the floors of those after it. With [`Sharing::Fair`] they share what remains by
+//!    max-min fairness in bytes per second instead.
 
-/// What is the same for all topics. Values outside of their ranges are taken as the nearest one inside.
+/// What is the same for all topics. Values outside of their ranges are taken as the nearest one
+/// inside.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Terms {
     /// `α`, at least 1.
@@ -116,7 +120,8 @@ pub struct Grant {
 pub struct Allocation {
     /// One for each topic.
     pub grants: Vec<Grant>,
-    /// Whether the budget is kept: `false` where standard topics alone exceed it, or the floors of large ones do.
+    /// Whether the budget is kept: `false` where standard topics alone exceed it, or the floors of
+    /// large ones do.
     pub feasible: bool,
     /// What they cost together, in bytes per second.
     pub used_bytes_per_s: f64,
@@ -126,8 +131,7 @@ impl Grant {
     /// What a lane of the topic runs at, in Hz.
     #[must_use]
     pub fn lane_hz(&self, lane: &Lane) -> f64 {
-        lane.max_rate_hz
-            .map_or(self.rate_hz, |most| self.rate_hz.min(most.max(0.0)))
+        lane.max_rate_hz.map_or(self.rate_hz, |most| self.rate_hz.min(most.max(0.0)))
     }
 }
 
@@ -150,16 +154,12 @@ impl Demand {
         let advertised_hz = sane(topic.advertised_hz);
         let message_bytes = topic.size_bytes as f64 * terms.overhead;
         let ask = |lane: &Lane| {
-            lane.max_rate_hz
-                .map_or(advertised_hz, |most| sane(most).min(advertised_hz))
+            lane.max_rate_hz.map_or(advertised_hz, |most| sane(most).min(advertised_hz))
         };
         let mut lanes_hz: Vec<f64> = topic.lanes.iter().map(ask).collect();
         lanes_hz.sort_by(f64::total_cmp);
-        let by_size = if topic.size_bytes > terms.large_bytes {
-            Class::Large
-        } else {
-            Class::Standard
-        };
+        let by_size =
+            if topic.size_bytes > terms.large_bytes { Class::Large } else { Class::Standard };
         Self {
             class: topic.class.unwrap_or(by_size),
             at,
@@ -177,7 +177,8 @@ impl Demand {
         hz * self.message_bytes
     }
 
-    /// The largest rate, `r_adv` at most, at which its lanes cost no more than so many bytes per second.
+    /// The largest rate, `r_adv` at most, at which its lanes cost no more than so many bytes per
+    /// second.
     fn rate_for(&self, bytes_per_s: f64) -> f64 {
         let mut hz_left = if self.message_bytes > 0.0 {
             bytes_per_s.max(0.0) / self.message_bytes
@@ -202,7 +203,8 @@ impl Demand {
     }
 }
 
-/// Works out the rate of each topic within a budget in bytes per second. Numbers that are none count as 0.
+/// Works out the rate of each topic within a budget in bytes per second. Numbers that are none
+/// count as 0.
 #[must_use]
 pub fn allocate(budget_bytes_per_s: f64, terms: &Terms, topics: &[Topic<'_>]) -> Allocation {
     let terms = &Terms {
@@ -212,11 +214,8 @@ pub fn allocate(budget_bytes_per_s: f64, terms: &Terms, topics: &[Topic<'_>]) ->
         ..*terms
     };
     let budget = sane(budget_bytes_per_s);
-    let mut demands: Vec<Demand> = topics
-        .iter()
-        .enumerate()
-        .map(|(at, topic)| Demand::new(at, topic, terms))
-        .collect();
+    let mut demands: Vec<Demand> =
+        topics.iter().enumerate().map(|(at, topic)| Demand::new(at, topic, terms)).collect();
     demands.sort_by(|one, other| {
         let by_demand = other.demand.total_cmp(&one.demand);
         by_demand.then_with(|| topics[one.at].name.cmp(topics[other.at].name))
@@ -234,29 +233,16 @@ pub fn allocate(budget_bytes_per_s: f64, terms: &Terms, topics: &[Topic<'_>]) ->
         Sharing::Paper => spending.give_in_order(terms, &large),
         Sharing::Fair => spending.give_fairly(terms, &large),
     }
-    let mut grants = vec![
-        Grant {
-            class: Class::Standard,
-            rate_hz: 0.0,
-            bytes_per_s: 0.0
-        };
-        topics.len()
-    ];
+    let mut grants =
+        vec![Grant { class: Class::Standard, rate_hz: 0.0, bytes_per_s: 0.0 }; topics.len()];
     for demand in standard.iter().chain(&large) {
         let rate_hz = spending.rates[demand.at];
-        grants[demand.at] = Grant {
-            class: demand.class,
-            rate_hz,
-            bytes_per_s: demand.cost(rate_hz),
-        };
+        grants[demand.at] =
+            Grant { class: demand.class, rate_hz, bytes_per_s: demand.cost(rate_hz) };
     }
     let used_bytes_per_s = grants.iter().fold(0.0, |used, grant| used + grant.bytes_per_s);
     let within = is_within(used_bytes_per_s, budget);
-    Allocation {
-        grants,
-        feasible: standard_fit && within,
-        used_bytes_per_s,
-    }
+    Allocation { grants, feasible: standard_fit && within, used_bytes_per_s }
 }
 
 /// What is being given out.
@@ -312,7 +298,8 @@ impl Spending {
         let level = level(&bounds, self.remaining);
         for (demand, (floor, most)) in large.iter().zip(bounds) {
             let share = level.clamp(floor, most);
-            // Rounding must not make a topic that is served in full seem thinned: the level is a difference of amounts up to the budget.
+            // Rounding must not make a topic that is served in full seem thinned: the level is a
+            // difference of amounts up to the budget.
             let rounding = 16.0 * f64::EPSILON * self.budget;
             let rate = if share + rounding >= demand.cost(demand.advertised_hz) {
                 demand.advertised_hz
@@ -329,11 +316,13 @@ impl Spending {
     }
 }
 
-/// The `λ` with `Σ clamp(λ, floor, most) = total`: infinite where all get their most, 0 where the floors exceed it.
+/// The `λ` with `Σ clamp(λ, floor, most) = total`: infinite where all get their most, 0 where the
+/// floors exceed it.
 fn level(bounds: &[(f64, f64)], total: f64) -> f64 {
     let mut points: Vec<f64> = bounds.iter().flat_map(|(floor, most)| [*floor, *most]).collect();
     points.sort_by(f64::total_cmp);
-    let sum_at = |level: f64| -> f64 { bounds.iter().map(|(floor, most)| level.clamp(*floor, *most)).sum() };
+    let sum_at =
+        |level: f64| -> f64 { bounds.iter().map(|(floor, most)| level.clamp(*floor, *most)).sum() };
     let next = points.partition_point(|point| sum_at(*point) < total);
     if next == points.len() {
         return f64::INFINITY;

@@ -17,11 +17,7 @@ impl TokenBucket {
     /// A full bucket that refills at `rate_hz` tokens per second.
     #[must_use]
     pub fn new(rate_hz: f64, now: Instant) -> Self {
-        Self {
-            rate_hz: rate_hz.max(0.0),
-            tokens: CAPACITY,
-            filled: now,
-        }
+        Self { rate_hz: rate_hz.max(0.0), tokens: CAPACITY, filled: now }
     }
 
     /// Tokens per second.
@@ -63,9 +59,8 @@ mod tests {
     fn fifty_hertz_is_thinned_to_ten() {
         let start = Instant::now();
         let mut bucket = TokenBucket::new(10.0, start);
-        let passed = (0..5000u32)
-            .filter(|n| bucket.admit(start + Duration::from_millis(20) * *n))
-            .count();
+        let passed =
+            (0..5000u32).filter(|n| bucket.admit(start + Duration::from_millis(20) * *n)).count();
         assert!((1000..=1002).contains(&passed), "{passed} of 5000 in 100 s");
     }
 

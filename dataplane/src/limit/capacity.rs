@@ -1,4 +1,5 @@
-//! How much a link carries: an estimate from what its peer reports. A state machine without I/O; time is passed in.
+//! How much a link carries: an estimate from what its peer reports. A state machine without I/O;
+//! time is passed in.
 //!
 //! ```text
 //! new ────▶ unknown: all of the limit ─┐                    it goes: it was ours
@@ -9,12 +10,14 @@
 //!
 //! A slow start begins higher where what is small needs more than 1/32 of the limit.
 //!
-//! Nothing is concluded from a delivered rate alone: it may be low because little was offered. What tells is a queue
-//! that does not go away (`path.rs`): as long as it lasts, what comes out of it is what the bottleneck carries, as the
-//! delivery rate of BBR (draft-ietf-ccwg-bbr). Whether the queue is ours is tried out (`trial.rs`).
+//! Nothing is concluded from a delivered rate alone: it may be low because little was offered. What
+//! tells is a queue that does not go away (`path.rs`): as long as it lasts, what comes out of it is
+//! what the bottleneck carries, as the delivery rate of BBR (draft-ietf-ccwg-bbr). Whether the
+//! queue is ours is tried out (`trial.rs`).
 //!
-//! The rate rises in steps only while at least half of it is used, as RFC 7661 has it for windows; else it doubles in
-//! half a minute, so that an estimate is forgotten in the end even if the traffic is thinned because of it.
+//! The rate rises in steps only while at least half of it is used, as RFC 7661 has it for windows;
+//! else it doubles in half a minute, so that an estimate is forgotten in the end even if the
+//! traffic is thinned because of it.
 
 mod path;
 mod trial;
@@ -25,14 +28,17 @@ use path::{Delay, Loss};
 use serde::Serialize;
 use trial::{DRAINING, Drain, Phase, SPARING, Spare, TRIALS, Verdict};
 
-/// The rate never falls below this, in bytes per second, unless the limit is lower: what is small must get through.
+/// The rate never falls below this, in bytes per second, unless the limit is lower: what is small
+/// must get through.
 pub const FLOOR_BYTES_PER_S: f64 = 16.0 * 1024.0;
 /// Nor below this share of the limit.
 pub const FLOOR_SHARE: f64 = 0.01;
-/// Share of the limit that slow start begins with: five doublings below, which take three seconds at a round trip of
-/// 50 ms. A path that now carries a hundredth of the limit gets three times that, not a hundred times.
+/// Share of the limit that slow start begins with: five doublings below, which take three seconds
+/// at a round trip of 50 ms. A path that now carries a hundredth of the limit gets three times
+/// that, not a hundred times.
 pub const START_SHARE: f64 = 1.0 / 32.0;
-/// … but with so many times what is small needs at least: it is not what fills a link, and should not wait until the link is known.
+/// … but with so many times what is small needs at least: it is not what fills a link, and should
+/// not wait until the link is known.
 pub const START_MARGIN: f64 = 1.25;
 /// Loss above the ordinary that counts as the sign of a full link, as in draft-ietf-rmcat-gcc.
 pub const LOSS: f64 = 0.1;
@@ -51,20 +57,22 @@ const USED: f64 = 0.5;
 const STEP_START: f64 = 1.5;
 const STEP_NEAR: f64 = 1.05;
 const STEP_FAR: f64 = 1.25;
-/// How long a step is tried, besides a round trip: two Feedback, and what a delay must last to count.
+/// How long a step is tried, besides a round trip: two Feedback, and what a delay must last to
+/// count.
 const STEP: Duration = Duration::from_millis(250);
 /// In what time an unused rate doubles.
 const FORGET_S: f64 = 30.0;
 /// Time at the limit without a queue after which nothing limits.
 const UNLIMITED: Duration = Duration::from_secs(10);
-/// Pause before the first step after a back-off; doubled each time the same estimate comes out, to spare the dips.
+/// Pause before the first step after a back-off; doubled each time the same estimate comes out, to
+/// spare the dips.
 const HOLD: Duration = Duration::from_secs(2);
 const LONGEST_HOLD: Duration = Duration::from_secs(8);
 /// A round trip above this is a mistake.
 const LONGEST_ROUND_TRIP: Duration = Duration::from_secs(30);
 
-/// What a Feedback tells. Bytes are wire bytes, as for [`Capacity::sent`]: a caller that counts less multiplies by its
-/// wire factor.
+/// What a Feedback tells. Bytes are wire bytes, as for [`Capacity::sent`]: a caller that counts
+/// less multiplies by its wire factor.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Seen {
     /// Received since the last Feedback.
@@ -110,7 +118,8 @@ pub struct Capacity {
     /// Before the next step.
     pause: Duration,
     hold: Duration,
-    /// What has been sent without a queue since the estimate, less what may be in a queue that is not seen yet.
+    /// What has been sent without a queue since the estimate, less what may be in a queue that is
+    /// not seen yet.
     proven: f64,
 }
 
@@ -137,7 +146,8 @@ impl Capacity {
         }
     }
 
-    /// Changes the limit in bytes per second from now on. Where nothing else limits, the rate follows at once.
+    /// Changes the limit in bytes per second from now on. Where nothing else limits, the rate
+    /// follows at once.
     pub fn set_limit(&mut self, limit_bytes_per_s: f64, now: Instant) {
         self.advance(now);
         let limit = sane_limit(limit_bytes_per_s);
@@ -152,14 +162,11 @@ impl Capacity {
         }
     }
 
-    /// So much is needed for what is small, LinkControl too, in bytes per second: no slow start is below that.
+    /// So much is needed for what is small, LinkControl too, in bytes per second: no slow start is
+    /// below that.
     pub fn set_needed(&mut self, bytes_per_s: f64, now: Instant) {
         self.advance(now);
-        self.needed = if bytes_per_s.is_finite() {
-            bytes_per_s.max(0.0)
-        } else {
-            0.0
-        };
+        self.needed = if bytes_per_s.is_finite() { bytes_per_s.max(0.0) } else { 0.0 };
         // It is known after the peer is back what goes there.
         if self.state() == State::SlowStart && self.rate < self.start().min(self.limit) {
             self.set_rate(self.start());
@@ -179,7 +186,8 @@ impl Capacity {
         self.step_sent += bytes;
     }
 
-    /// The peer was suspect or down and is back, or a link epoch begins: the path may be another one. Slow start.
+    /// The peer was suspect or down and is back, or a link epoch begins: the path may be another
+    /// one. Slow start.
     pub fn outage(&mut self, now: Instant) {
         self.advance(now);
         self.estimate = None;
@@ -207,14 +215,15 @@ impl Capacity {
         self.rise();
     }
 
-    /// What may be sent now, in bytes per second: at most the limit, at least [`FLOOR_BYTES_PER_S`] and [`FLOOR_SHARE`]
-    /// of the limit, if the limit allows.
+    /// What may be sent now, in bytes per second: at most the limit, at least [`FLOOR_BYTES_PER_S`]
+    /// and [`FLOOR_SHARE`] of the limit, if the limit allows.
     #[must_use]
     pub fn bytes_per_s(&self) -> f64 {
         self.rate
     }
 
-    /// What the link carries, in bytes per second, at most the limit. `None`: nothing is known to limit below that.
+    /// What the link carries, in bytes per second, at most the limit. `None`: nothing is known to
+    /// limit below that.
     #[must_use]
     pub fn measured(&self) -> Option<f64> {
         let estimate = self.estimate?;
@@ -279,7 +288,8 @@ impl Capacity {
     fn drain(&mut self, before: f64, carried: f64, trial: u32) {
         // The floor may be more than the half.
         let shrinking = 1.0 - self.floor() / carried;
-        self.phase = Phase::Draining(Drain::new(self.now, &self.delay, before, carried, trial, shrinking));
+        self.phase =
+            Phase::Draining(Drain::new(self.now, &self.delay, before, carried, trial, shrinking));
         self.set_rate(carried * DRAINING);
     }
 
@@ -289,7 +299,9 @@ impl Capacity {
             Verdict::Gone => self.learn(drain.carried),
             Verdict::Slower | Verdict::Less => self.drain(drain.before, drain.carried, 1),
             // The link may have become slower meanwhile, by as much as was tried.
-            Verdict::Stays if drain.trial < TRIALS => self.drain(drain.before, drain.carried, drain.trial + 1),
+            Verdict::Stays if drain.trial < TRIALS => {
+                self.drain(drain.before, drain.carried, drain.trial + 1)
+            }
             Verdict::Stays => {
                 self.delay.is_own(self.now, drain.least);
                 self.resume(drain.before);
@@ -305,11 +317,7 @@ impl Capacity {
         let estimate = near.map_or(carried, |known| f64::midpoint(known, carried));
         let estimate = estimate.max(self.floor()).min(self.limit);
         self.estimate = Some(estimate);
-        self.hold = if near.is_some() {
-            (self.hold * 2).min(LONGEST_HOLD)
-        } else {
-            HOLD
-        };
+        self.hold = if near.is_some() { (self.hold * 2).min(LONGEST_HOLD) } else { HOLD };
         self.resume(estimate * KEPT);
         self.pause = self.hold;
         self.proven = 0.0;
@@ -380,11 +388,7 @@ impl Capacity {
 }
 
 fn sane_limit(bytes_per_s: f64) -> f64 {
-    if bytes_per_s.is_nan() {
-        1.0
-    } else {
-        bytes_per_s.clamp(1.0, HIGHEST_LIMIT)
-    }
+    if bytes_per_s.is_nan() { 1.0 } else { bytes_per_s.clamp(1.0, HIGHEST_LIMIT) }
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! How often one bridge lets a message pass, as far as those who ask for it say. What the budget says is for whole lanes:
-//! [`LaneGates`](crate::lane::allocation::LaneGates).
+//! How often one bridge lets a message pass, as far as those who ask for it say. What the budget
+//! says is for whole lanes: [`LaneGates`](crate::lane::allocation::LaneGates).
 
 use std::time::Instant;
 
@@ -12,12 +12,11 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// A gate for what requesters ask for at most, and the operator allows, in Hz; `None`: all that is published.
+    /// A gate for what requesters ask for at most, and the operator allows, in Hz; `None`: all that
+    /// is published.
     #[must_use]
     pub fn new(max_rate_hz: Option<f64>, now: Instant) -> Self {
-        Self {
-            bucket: max_rate_hz.map(|most| TokenBucket::new(most, now)),
-        }
+        Self { bucket: max_rate_hz.map(|most| TokenBucket::new(most, now)) }
     }
 
     /// Requesters ask for another rate.
@@ -54,10 +53,7 @@ mod tests {
         let mut gate = Gate::new(Some(1.0), start);
         assert!(gate.admit(start) && gate.admit(start) && !gate.admit(start));
         gate.set_max_rate(Some(100.0), start + Duration::from_millis(100));
-        assert!(
-            !gate.admit(start + Duration::from_millis(100)),
-            "a tenth of a token is none"
-        );
+        assert!(!gate.admit(start + Duration::from_millis(100)), "a tenth of a token is none");
         assert!(gate.admit(start + Duration::from_millis(110)));
         gate.set_max_rate(None, start + Duration::from_millis(110));
         assert_eq!(passed(&mut gate, start + Duration::from_millis(110)), 500);

@@ -6,8 +6,9 @@
 //! Feedback ──► capacity ───────┘        ▲ topics, sizes, advertised rates
 //! ```
 //!
-//! It is anew when a topic or lane comes or goes, a size grows, a measured rate or the wire factor moves, a capacity changes, or the node
-//! file does. All of these together cost one run at most every 20 ms; sizes that grow alone one every 100 ms.
+//! It is anew when a topic or lane comes or goes, a size grows, a measured rate or the wire factor
+//! moves, a capacity changes, or the node file does. All of these together cost one run at most
+//! every 20 ms; sizes that grow alone one every 100 ms.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -20,7 +21,8 @@ use super::wire_factor::{FIRST, Totals, WireFactor, budget};
 
 /// Between two runs.
 const BETWEEN: Duration = Duration::from_millis(20);
-/// Between two runs where nothing but sizes has grown: those of a topic that has just begun grow with every few messages.
+/// Between two runs where nothing but sizes has grown: those of a topic that has just begun grow
+/// with every few messages.
 const BETWEEN_SIZES: Duration = Duration::from_millis(100);
 /// Between two looks at what is measured.
 const LOOK: Duration = Duration::from_millis(500);
@@ -48,7 +50,8 @@ pub struct Limiter {
     measured: BTreeMap<FlowId, LinkRate>,
     all: WireFactor,
     links: BTreeMap<LayerName, WireFactor>,
-    /// Flows that lanes go to, by layer, and what standard topics take of the links to them; as of the last run.
+    /// Flows that lanes go to, by layer, and what standard topics take of the links to them; as of
+    /// the last run.
     receivers: BTreeMap<LayerName, BTreeSet<FlowId>>,
     standard: BTreeMap<FlowId, f64>,
     /// Budgets that the last run was made with.
@@ -67,11 +70,7 @@ impl Limiter {
     /// A limiter that has not run.
     #[must_use]
     pub fn new(bandwidth: BandwidthSection) -> Self {
-        Self {
-            bandwidth,
-            due: true,
-            ..Self::default()
-        }
+        Self { bandwidth, due: true, ..Self::default() }
     }
 
     /// Takes what the node file says now.
@@ -105,7 +104,8 @@ impl Limiter {
         due
     }
 
-    /// Takes what was measured: totals of all links together and of those to each layer, and what the links can carry.
+    /// Takes what was measured: totals of all links together and of those to each layer, and what
+    /// the links can carry.
     pub fn look(
         &mut self,
         now: Instant,
@@ -126,7 +126,8 @@ impl Limiter {
         }
     }
 
-    /// Whether rates have to be worked out now. A change that comes right after a run waits a little.
+    /// Whether rates have to be worked out now. A change that comes right after a run waits a
+    /// little.
     #[must_use]
     pub fn is_due(&self, now: Instant) -> bool {
         let waited = |pause| self.ran.is_none_or(|at| now.saturating_duration_since(at) >= pause);
@@ -145,7 +146,8 @@ impl Limiter {
                 LinkRate::Passing(bytes_per_s) => (bytes_per_s, true),
                 LinkRate::Carries(bytes_per_s) => (bytes_per_s, false),
             };
-            let bytes_per_s = self.budget(carries, Some(&flow.layer), self.control_share(&flow.layer));
+            let bytes_per_s =
+                self.budget(carries, Some(&flow.layer), self.control_share(&flow.layer));
             let budget = FlowBudget { bytes_per_s, passing };
             Some((flow.clone(), budget))
         };
@@ -156,8 +158,8 @@ impl Limiter {
         }
     }
 
-    /// What a limit of all links (`None`) or of those to a layer leaves, in bytes per second of `s · α`. `share` of the control messages there go
-    /// that way.
+    /// What a limit of all links (`None`) or of those to a layer leaves, in bytes per second of `s
+    /// · α`. `share` of the control messages there go that way.
     fn budget(&self, limit: f64, layer: Option<&LayerName>, share: f64) -> f64 {
         let link = layer.map_or(Some(&self.all), |layer| self.links.get(layer));
         let control = link.map_or(0.0, WireFactor::control_bytes_per_s) * share;
@@ -187,13 +189,12 @@ impl Limiter {
         let rates = rates(&budgets, &terms, demands);
         let on_the_wire = |(flow, bytes_per_s): (FlowId, f64)| {
             let control = self.links.get(&flow.layer).map_or(0.0, WireFactor::control_bytes_per_s);
-            let wire = bytes_per_s * self.of_messages(Some(&flow.layer)) + control * self.control_share(&flow.layer);
+            let wire = bytes_per_s * self.of_messages(Some(&flow.layer))
+                + control * self.control_share(&flow.layer);
             (flow, wire)
         };
-        let standard = standard_load(&rates, &terms, demands)
-            .into_iter()
-            .map(on_the_wire)
-            .collect();
+        let standard =
+            standard_load(&rates, &terms, demands).into_iter().map(on_the_wire).collect();
         self.standard = standard;
         self.note_receivers(demands);
         tell(&mut self.told, self.bandwidth.limit_mbps, &rates, now);
@@ -225,20 +226,16 @@ impl Limiter {
     /// Layers that lanes go to, or whose links have a limit of their own.
     #[must_use]
     pub fn layers(&self) -> BTreeSet<LayerName> {
-        self.receivers
-            .keys()
-            .chain(self.bandwidth.links.keys())
-            .cloned()
-            .collect()
+        self.receivers.keys().chain(self.bandwidth.links.keys()).cloned().collect()
     }
 
-    /// ω of all links (`None`) or of those to a layer; `None` while too little was sent there to tell, and 1 where it is left out.
+    /// ω of all links (`None`) or of those to a layer; `None` while too little was sent there to
+    /// tell, and 1 where it is left out.
     #[must_use]
     pub fn wire_factor(&self, layer: Option<&LayerName>) -> Option<f64> {
         let process = self.bandwidth.limit_bytes_per_s();
-        let limit = layer
-            .and_then(|layer| self.bandwidth.link_limit_bytes_per_s(layer))
-            .unwrap_or(process);
+        let limit =
+            layer.and_then(|layer| self.bandwidth.link_limit_bytes_per_s(layer)).unwrap_or(process);
         let factor = layer.map_or(Some(&self.all), |layer| self.links.get(layer));
         if self.bandwidth.wire_overhead == WireOverhead::Measured {
             factor?.of_messages(self.bandwidth.overhead)?;
@@ -247,8 +244,8 @@ impl Limiter {
         Some(limit / self.budget(limit, layer, 1.0).max(f64::MIN_POSITIVE))
     }
 
-    /// Wire bytes per second that the links to all flows (`None`) or to those of a layer carry that lanes go to; `None` while one of them was not
-    /// seen to carry less than its limit.
+    /// Wire bytes per second that the links to all flows (`None`) or to those of a layer carry that
+    /// lanes go to; `None` while one of them was not seen to carry less than its limit.
     #[must_use]
     pub fn measured_bytes_per_s(&self, layer: Option<&LayerName>) -> Option<f64> {
         let mut sum: Option<f64> = None;
@@ -279,10 +276,13 @@ impl Limiter {
     }
 }
 
-/// Says in the log whether everything fits, when that has changed, and not more often than every few seconds.
+/// Says in the log whether everything fits, when that has changed, and not more often than every
+/// few seconds.
 fn tell(told: &mut Option<(Instant, bool)>, limit_mbps: f64, rates: &Rates, now: Instant) {
     let (before, at) = told.map_or((true, None), |(at, feasible)| (feasible, Some(at)));
-    if rates.feasible == before || at.is_some_and(|at| now.saturating_duration_since(at) < TOLD_EVERY) {
+    if rates.feasible == before
+        || at.is_some_and(|at| now.saturating_duration_since(at) < TOLD_EVERY)
+    {
         return;
     }
     *told = Some((now, rates.feasible));
@@ -302,14 +302,14 @@ fn tell(told: &mut Option<(Instant, bool)>, limit_mbps: f64, rates: &Rates, now:
 fn has_moved(before: &Budgets, after: &Budgets) -> bool {
     let moved = |before: f64, after: f64| (after - before).abs() > MOVED * before;
     let of_links = before.links.len() != after.links.len()
-        || after
-            .links
-            .iter()
-            .any(|(layer, after)| before.links.get(layer).is_none_or(|before| moved(*before, *after)));
+        || after.links.iter().any(|(layer, after)| {
+            before.links.get(layer).is_none_or(|before| moved(*before, *after))
+        });
     let of_flows = before.flows.len() != after.flows.len()
         || after.flows.iter().any(|(flow, after)| {
-            let differs =
-                |before: &FlowBudget| before.passing != after.passing || moved(before.bytes_per_s, after.bytes_per_s);
+            let differs = |before: &FlowBudget| {
+                before.passing != after.passing || moved(before.bytes_per_s, after.bytes_per_s)
+            };
             before.flows.get(flow).is_none_or(differs)
         });
     moved(before.process, after.process) || of_links || of_flows
@@ -385,11 +385,10 @@ mod tests {
         assert!(limiter.is_due(start));
         limiter.run(start, &[]);
         assert!(!limiter.is_due(start + SECOND));
-        limiter.set_bandwidth(BandwidthSection {
-            limit_mbps: 4.0,
-            ..limiter.bandwidth().clone()
-        });
-        assert!(!limiter.is_due(start + Duration::from_millis(5)) && limiter.is_due(start + BETWEEN));
+        limiter.set_bandwidth(BandwidthSection { limit_mbps: 4.0, ..limiter.bandwidth().clone() });
+        assert!(
+            !limiter.is_due(start + Duration::from_millis(5)) && limiter.is_due(start + BETWEEN)
+        );
     }
 
     #[test]
@@ -430,14 +429,10 @@ mod tests {
         }
         let quiet = runs.iter().filter(|second| (30..60).contains(*second)).count();
         assert_eq!(quiet, 0, "{runs:?}");
-        assert!(
-            runs.iter().any(|second| (61..70).contains(second)) && runs.len() < 60,
-            "{runs:?}"
-        );
-        for factor in [
-            limiter.wire_factor(None).unwrap(),
-            limiter.wire_factor(Some(&cloud)).unwrap(),
-        ] {
+        assert!(runs.iter().any(|second| (61..70).contains(second)) && runs.len() < 60, "{runs:?}");
+        for factor in
+            [limiter.wire_factor(None).unwrap(), limiter.wire_factor(Some(&cloud)).unwrap()]
+        {
             assert!((factor - 1.32 / allocated(1.0)).abs() < 0.01, "{factor}");
         }
         let fog: LayerName = "fog".parse().unwrap();
@@ -449,7 +444,10 @@ mod tests {
         let cloud = cloud();
         let mut limiter = limiter(80.0, WireOverhead::Off);
         limiter.set_bandwidth(BandwidthSection {
-            links: BTreeMap::from([(cloud.clone(), blaze_domain::node_file::LinkLimit { limit_mbps: 40.0 })]),
+            links: BTreeMap::from([(
+                cloud.clone(),
+                blaze_domain::node_file::LinkLimit { limit_mbps: 40.0 },
+            )]),
             ..limiter.bandwidth().clone()
         });
         assert!((camera_hz(&mut limiter) - 5.0 * 1_048_576.0 / 100_000.0).abs() < 1e-9);
@@ -487,12 +485,7 @@ mod tests {
             ];
             look(&mut limiter, Instant::now(), &links);
             let layer = |name: &str| limiter.measured_bytes_per_s(Some(&name.parse().unwrap()));
-            (
-                limiter.measured_bytes_per_s(None),
-                layer("cloud"),
-                layer("fog"),
-                layer("edge"),
-            )
+            (limiter.measured_bytes_per_s(None), layer("cloud"), layer("fog"), layer("edge"))
         };
         assert_eq!(shown(LinkRate::Free), (None, Some(3e6), None, None));
         // A slow start has a rate, and has measured nothing.
@@ -504,11 +497,7 @@ mod tests {
     fn a_link_that_rises_thins_what_is_large_and_is_no_fault() {
         let receivers = [flow("cloud/a")];
         let mut limiter = limiter(80.0, WireOverhead::Off);
-        look(
-            &mut limiter,
-            Instant::now(),
-            &[("cloud/a", LinkRate::Passing(150_000.0))],
-        );
+        look(&mut limiter, Instant::now(), &[("cloud/a", LinkRate::Passing(150_000.0))]);
         let demands = [camera(&receivers), topic("odom", 1_000, &receivers)];
         let rates = limiter.run(Instant::now(), &demands);
         assert_eq!(rates.topics[1].lanes_hz, [100.0]);
@@ -517,11 +506,7 @@ mod tests {
         let standard = limiter.standard_wire_bytes_per_s()[&receivers[0]];
         assert!((standard - 100.0 * 1_000.0 * FIRST).abs() < 1e-6, "{standard}");
         // The same rate as that of the link does not suffice, and is told.
-        look(
-            &mut limiter,
-            Instant::now(),
-            &[("cloud/a", LinkRate::Carries(150_000.0))],
-        );
+        look(&mut limiter, Instant::now(), &[("cloud/a", LinkRate::Carries(150_000.0))]);
         assert!(limiter.due && !limiter.run(Instant::now(), &demands).feasible);
     }
 
@@ -530,10 +515,8 @@ mod tests {
         let start = Instant::now();
         let receivers = [flow("cloud/a")];
         let mut limiter = limiter(80.0, WireOverhead::Off);
-        let (fits, does_not) = (
-            topic("odom", 1_000, &receivers),
-            topic("points", 60_000_000, &receivers),
-        );
+        let (fits, does_not) =
+            (topic("odom", 1_000, &receivers), topic("points", 60_000_000, &receivers));
         let mut told = BTreeSet::new();
         for tenth in 0..300u32 {
             let demand = if tenth % 2 == 0 { &does_not } else { &fits };

@@ -4,7 +4,8 @@
 //! budgets, sizes, rates ─► allocate (F9) ─► rates ─► gate: whole messages, per lane ─► queues ─► pacer: wire bytes
 //! ```
 //!
-//! The allocation decides what is worth sending, in whole messages; the pacer keeps the limit, whatever was decided.
+//! The allocation decides what is worth sending, in whole messages; the pacer keeps the limit,
+//! whatever was decided.
 
 pub mod allocate;
 pub mod bucket;

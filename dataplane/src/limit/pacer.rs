@@ -1,35 +1,40 @@
 //! When the next datagram may leave, in wire bytes.
 //!
-//! The pacer spends a budget that refills with time. After a pause in which nothing was to be sent at most two datagrams are saved, so
-//! that no burst fills a queue behind it. While something waits, what a late wake-up of the sending thread has let go by is made good, up
-//! to [`LATE`]: on a busy machine a link would otherwise carry less than its limit, however much waits for it. LinkControl is never held
-//! back: it may put the pacer into debt, which user data then waits off.
+//! The pacer spends a budget that refills with time. After a pause in which nothing was to be sent
+//! at most two datagrams are saved, so that no burst fills a queue behind it. While something
+//! waits, what a late wake-up of the sending thread has let go by is made good, up to [`LATE`]: on
+//! a busy machine a link would otherwise carry less than its limit, however much waits for it.
+//! LinkControl is never held back: it may put the pacer into debt, which user data then waits off.
 //!
-//! The limit holds for the wire, and the pacer stands before it. [`RESERVE`] of the limit is kept for what happens
-//! between them, and of what the pacer lets out the allocation gives out all but [`HEADROOM`]: 98.6 % of the limit.
+//! The limit holds for the wire, and the pacer stands before it. [`RESERVE`] of the limit is kept
+//! for what happens between them, and of what the pacer lets out the allocation gives out all but
+//! [`HEADROOM`]: 98.6 % of the limit.
 
 use std::time::{Duration, Instant};
 
 /// A burst is at most this many datagrams.
 pub const BURST_DATAGRAMS: usize = 2;
 
-/// Of what the sending thread has missed while something waited so much is made good: as late as a scheduler with few cores often
-/// wakes it. More would use up a little more of the limit on a busy machine, and be felt: what is made good at once stands before a
-/// narrow place until the difference between its rate and the limit has worked it off. Two cameras over 40 Mbit/s on two cores: with 0,
-/// 1.5 and 4 ms 97.6–98.5 %, 98.3–98.9 % and 98.7–98.8 % of the limit were used, and the 99th percentile of the latency of small
-/// messages was 28.5–30.1, 29.1–30.7 and 31.6–33.6 ms.
+/// Of what the sending thread has missed while something waited so much is made good: as late as a
+/// scheduler with few cores often wakes it. More would use up a little more of the limit on a busy
+/// machine, and be felt: what is made good at once stands before a narrow place until the
+/// difference between its rate and the limit has worked it off. Two cameras over 40 Mbit/s on two
+/// cores: with 0, 1.5 and 4 ms 97.6–98.5 %, 98.3–98.9 % and 98.7–98.8 % of the limit were used, and
+/// the 99th percentile of the latency of small messages was 28.5–30.1, 29.1–30.7 and 31.6–33.6 ms.
 pub const LATE: Duration = Duration::from_micros(1_500);
 
-/// Share of the limit that is not spent, for what the pacer does not see: RustDDS' own discovery, and that RustDDS sends
-/// from a thread of its own. What that thread holds back while it waits for the processor leaves within the next second, on
-/// top of that second's own: where the pacer lets out `1 − RESERVE` of the limit, and what [`LATE`] makes good, a second stays
-/// within the limit after a pause of up to 8 ms.
+/// Share of the limit that is not spent, for what the pacer does not see: RustDDS' own discovery,
+/// and that RustDDS sends from a thread of its own. What that thread holds back while it waits for
+/// the processor leaves within the next second, on top of that second's own: where the pacer lets
+/// out `1 − RESERVE` of the limit, and what [`LATE`] makes good, a second stays within the limit
+/// after a pause of up to 8 ms.
 pub const RESERVE: f64 = 0.01;
 
-/// Share of what the pacer lets out that is not allocated. A queue that is filled as fast as it is emptied never becomes shorter
-/// again, whatever made it long: a repair, a snapshot, images of two cameras at the same moment. With this its use is 0.996, and a
-/// surplus image at 5 MB/s is worked off in 50 s. More would cost images: all that is left out here is left out of the large
-/// topic that gets the rest, whose rate then lies further below what the whole limit would give it.
+/// Share of what the pacer lets out that is not allocated. A queue that is filled as fast as it is
+/// emptied never becomes shorter again, whatever made it long: a repair, a snapshot, images of two
+/// cameras at the same moment. With this its use is 0.996, and a surplus image at 5 MB/s is worked
+/// off in 50 s. More would cost images: all that is left out here is left out of the large topic
+/// that gets the rest, whose rate then lies further below what the whole limit would give it.
 pub const HEADROOM: f64 = 0.004;
 
 /// What of a limit in bytes per second is given out to topics and control messages.
@@ -38,7 +43,8 @@ pub fn allocated(limit_bytes_per_s: f64) -> f64 {
     limit_bytes_per_s.max(0.0) * (1.0 - RESERVE) * (1.0 - HEADROOM)
 }
 
-/// A budget of wire bytes per second. It is exact over any second: what was spent is never forgotten.
+/// A budget of wire bytes per second. It is exact over any second: what was spent is never
+/// forgotten.
 #[derive(Debug, Clone)]
 pub struct Pacer {
     limit_bytes_per_s: f64,
@@ -191,8 +197,7 @@ mod tests {
 
     fn most_bytes_in_a_second(sent: &[Instant]) -> usize {
         let within = |first: Instant| {
-            sent.iter()
-                .filter(move |at| **at >= first && **at < first + Duration::from_secs(1))
+            sent.iter().filter(move |at| **at >= first && **at < first + Duration::from_secs(1))
         };
         sent.iter().map(|first| 1400 * within(*first).count()).max().unwrap()
     }
@@ -205,9 +210,7 @@ mod tests {
         assert!(total > 4_800_000, "{total} bytes in 5 s");
         // Nor where the transport stands still for 8 ms.
         let (from, until) = (start + Duration::from_secs(2), start + Duration::from_millis(2008));
-        let held_back = sent
-            .iter()
-            .map(|at| if (from..until).contains(at) { until } else { *at });
+        let held_back = sent.iter().map(|at| if (from..until).contains(at) { until } else { *at });
         for sent in [&sent, &held_back.collect()] {
             let most = most_bytes_in_a_second(sent);
             assert!(most <= 1_000_000, "{most} bytes in a second");

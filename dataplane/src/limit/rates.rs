@@ -1,7 +1,9 @@
-//! What each lane of one flow runs at: the budget of the process, and the budgets of single links besides (F9). A link has a budget where
-//! the node file limits what goes to its layer, and where it was seen to carry less.
+//! What each lane of one flow runs at: the budget of the process, and the budgets of single links
+//! besides (F9). A link has a budget where the node file limits what goes to its layer, and where
+//! it was seen to carry less.
 //!
-//! The same function serves the running flow and `blaze plan`, so that what was planned is what happens.
+//! The same function serves the running flow and `blaze plan`, so that what was planned is what
+//! happens.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -52,8 +54,8 @@ pub struct Budgets {
 pub struct FlowBudget {
     /// In bytes per second of `s · α`.
     pub bytes_per_s: f64,
-    /// It is not what the link carries, but a step on the way there: large topics are thinned to it and standard ones are not, and nobody is
-    /// told that it is too small.
+    /// It is not what the link carries, but a step on the way there: large topics are thinned to it
+    /// and standard ones are not, and nobody is told that it is too small.
     pub passing: bool,
 }
 
@@ -98,7 +100,8 @@ pub fn terms(bandwidth: &BandwidthSection) -> Terms {
     }
 }
 
-/// Works out what each lane runs at: the smallest of what the budget of the process and those of its link give it.
+/// Works out what each lane runs at: the smallest of what the budget of the process and those of
+/// its link give it.
 #[must_use]
 pub fn rates(budgets: &Budgets, terms: &Terms, demands: &[Demand<'_>]) -> Rates {
     let (of_process, process_feasible) = within(budgets.process, terms, demands, |_| true);
@@ -107,27 +110,24 @@ pub fn rates(budgets: &Budgets, terms: &Terms, demands: &[Demand<'_>]) -> Rates 
         .map(|(at, grant)| TopicRates {
             class: grant.class,
             rate_hz: grant.rate_hz,
-            lanes_hz: demands[at]
-                .lanes
-                .iter()
-                .map(|lane| grant.lane_hz(&as_lane(lane)))
-                .collect(),
+            lanes_hz: demands[at].lanes.iter().map(|lane| grant.lane_hz(&as_lane(lane))).collect(),
         })
         .collect();
-    let mut bound = |budget: f64, spares_standard: bool, is_in: &dyn Fn(&LaneDemand<'_>) -> bool| -> bool {
-        let (of_link, feasible) = within(budget, terms, demands, is_in);
-        for (at, grant) in of_link {
-            if spares_standard && grant.class == Class::Standard {
-                continue;
-            }
-            for (lane, hz) in demands[at].lanes.iter().zip(&mut topics[at].lanes_hz) {
-                if is_in(lane) {
-                    *hz = hz.min(grant.lane_hz(&as_lane(lane)));
+    let mut bound =
+        |budget: f64, spares_standard: bool, is_in: &dyn Fn(&LaneDemand<'_>) -> bool| -> bool {
+            let (of_link, feasible) = within(budget, terms, demands, is_in);
+            for (at, grant) in of_link {
+                if spares_standard && grant.class == Class::Standard {
+                    continue;
+                }
+                for (lane, hz) in demands[at].lanes.iter().zip(&mut topics[at].lanes_hz) {
+                    if is_in(lane) {
+                        *hz = hz.min(grant.lane_hz(&as_lane(lane)));
+                    }
                 }
             }
-        }
-        feasible
-    };
+            feasible
+        };
     let mut infeasible_links = BTreeSet::new();
     for (layer, budget) in &budgets.links {
         if !bound(*budget, false, &|lane: &LaneDemand<'_>| lane.layer == layer) {
@@ -144,7 +144,8 @@ pub fn rates(budgets: &Budgets, terms: &Terms, demands: &[Demand<'_>]) -> Rates 
     let mut load_bytes_per_s: BTreeMap<LayerName, f64> = BTreeMap::new();
     for (demand, topic) in demands.iter().zip(&topics) {
         for (lane, hz) in demand.lanes.iter().zip(&topic.lanes_hz) {
-            *load_bytes_per_s.entry(lane.layer.clone()).or_default() += hz * demand.message_bytes(terms);
+            *load_bytes_per_s.entry(lane.layer.clone()).or_default() +=
+                hz * demand.message_bytes(terms);
         }
     }
     Rates {
@@ -156,15 +157,17 @@ pub fn rates(budgets: &Budgets, terms: &Terms, demands: &[Demand<'_>]) -> Rates 
     }
 }
 
-/// What the standard topics take of the link to each flow at the rates that the budget of the process gives them, whatever the link carries;
-/// in bytes per second of `s · α`.
+/// What the standard topics take of the link to each flow at the rates that the budget of the
+/// process gives them, whatever the link carries; in bytes per second of `s · α`.
 #[must_use]
-pub fn standard_load(rates: &Rates, terms: &Terms, demands: &[Demand<'_>]) -> BTreeMap<FlowId, f64> {
+pub fn standard_load(
+    rates: &Rates,
+    terms: &Terms,
+    demands: &[Demand<'_>],
+) -> BTreeMap<FlowId, f64> {
     let mut load: BTreeMap<FlowId, f64> = BTreeMap::new();
-    let standard = demands
-        .iter()
-        .zip(&rates.topics)
-        .filter(|(_, topic)| topic.class == Class::Standard);
+    let standard =
+        demands.iter().zip(&rates.topics).filter(|(_, topic)| topic.class == Class::Standard);
     for (demand, topic) in standard {
         for lane in &demand.lanes {
             let Some(receiver) = lane.receiver else { continue };
@@ -182,8 +185,8 @@ impl Demand<'_> {
     }
 }
 
-/// The allocation of one budget among the lanes that are in it: what each topic is granted that has any, by its place, and whether the
-/// budget is kept.
+/// The allocation of one budget among the lanes that are in it: what each topic is granted that has
+/// any, by its place, and whether the budget is kept.
 fn within(
     budget: f64,
     terms: &Terms,
@@ -192,7 +195,8 @@ fn within(
 ) -> (Vec<(usize, Grant)>, bool) {
     let (mut places, mut topics) = (Vec::new(), Vec::new());
     for (at, demand) in demands.iter().enumerate() {
-        let lanes: Vec<Lane> = demand.lanes.iter().filter(|lane| is_in(lane)).map(as_lane).collect();
+        let lanes: Vec<Lane> =
+            demand.lanes.iter().filter(|lane| is_in(lane)).map(as_lane).collect();
         // One that goes nowhere costs nothing, and is granted what it says.
         if lanes.is_empty() && !demand.lanes.is_empty() {
             continue;
@@ -211,9 +215,7 @@ fn within(
 }
 
 fn as_lane(lane: &LaneDemand<'_>) -> Lane {
-    Lane {
-        max_rate_hz: lane.max_rate_hz,
-    }
+    Lane { max_rate_hz: lane.max_rate_hz }
 }
 
 #[cfg(test)]
@@ -225,29 +227,20 @@ mod tests {
     }
 
     fn lane(layer: &LayerName) -> LaneDemand<'_> {
-        LaneDemand {
-            layer,
-            receiver: None,
-            max_rate_hz: None,
-        }
+        LaneDemand { layer, receiver: None, max_rate_hz: None }
     }
 
     fn to(receiver: &FlowId) -> LaneDemand<'_> {
-        LaneDemand {
-            layer: &receiver.layer,
-            receiver: Some(receiver),
-            max_rate_hz: None,
-        }
+        LaneDemand { layer: &receiver.layer, receiver: Some(receiver), max_rate_hz: None }
     }
 
-    fn demand<'a>(topic: &'a str, size_bytes: u64, advertised_hz: f64, lanes: Vec<LaneDemand<'a>>) -> Demand<'a> {
-        Demand {
-            topic,
-            size_bytes,
-            advertised_hz,
-            class: None,
-            lanes,
-        }
+    fn demand<'a>(
+        topic: &'a str,
+        size_bytes: u64,
+        advertised_hz: f64,
+        lanes: Vec<LaneDemand<'a>>,
+    ) -> Demand<'a> {
+        Demand { topic, size_bytes, advertised_hz, class: None, lanes }
     }
 
     /// Two cameras and an IMU to fog and cloud; the cloud's link is narrow.
@@ -255,18 +248,16 @@ mod tests {
     fn a_lane_runs_at_the_smaller_of_both_rates() {
         let (fog, cloud) = (layer("fog"), layer("cloud"));
         let both = || vec![lane(&fog), lane(&cloud)];
-        let demands = [
-            demand("camera", 1_000_000, 30.0, both()),
-            demand("imu", 1_000, 50.0, both()),
-        ];
+        let demands =
+            [demand("camera", 1_000_000, 30.0, both()), demand("imu", 1_000, 50.0, both())];
         let budgets = Budgets {
             process: 100e6,
             links: BTreeMap::from([(cloud.clone(), 5_151_000.0)]),
             ..Budgets::default()
         };
         let got = rates(&budgets, &Terms::default(), &demands);
-        // The camera to the fog is whole; to the cloud 5,151,000 B/s less the IMU's 50 · 1,020 leave five images of 1,020,000 B, and
-        // β allows 0.95 · 5,151,000 / 1,020,000 = 4.797.
+        // The camera to the fog is whole; to the cloud 5,151,000 B/s less the IMU's 50 · 1,020
+        // leave five images of 1,020,000 B, and β allows 0.95 · 5,151,000 / 1,020,000 = 4.797.
         assert_eq!(got.topics[0].lanes_hz[0], 30.0);
         assert!((got.topics[0].lanes_hz[1] - 0.95 * 5_151_000.0 / 1_020_000.0).abs() < 1e-9);
         assert_eq!(got.topics[1].lanes_hz, [50.0, 50.0]);
@@ -292,7 +283,8 @@ mod tests {
     /// Two robots of one layer; the radio of one of them is bad.
     #[test]
     fn a_slow_link_to_one_flow_thins_what_goes_there_alone() {
-        let (one, other): (FlowId, FlowId) = ("edge/robot-1".parse().unwrap(), "edge/robot-2".parse().unwrap());
+        let (one, other): (FlowId, FlowId) =
+            ("edge/robot-1".parse().unwrap(), "edge/robot-2".parse().unwrap());
         let both = || vec![to(&one), to(&other)];
         let demands = [
             demand("map", 1_000_000, 10.0, both()),
@@ -318,7 +310,8 @@ mod tests {
         assert_eq!(slow(1e6, false).infeasible_links, BTreeSet::from([layer("edge")]));
         let got = slow(1e6, true);
         assert!(got.feasible && (got.topics[0].lanes_hz[1] - 2.0).abs() < 1e-9);
-        // What is small is thinned by what a link carries, not by what it is asked to carry for a moment.
+        // What is small is thinned by what a link carries, not by what it is asked to carry for a
+        // moment.
         assert!(slow(5_000.0, false).topics[1].lanes_hz[1] < 5.0);
         assert_eq!(slow(5_000.0, true).topics[1].lanes_hz, [10.0, 10.0]);
     }
@@ -326,10 +319,7 @@ mod tests {
     #[test]
     fn what_standard_topics_take_of_a_link_does_not_depend_on_it() {
         let robot: FlowId = "edge/robot-1".parse().unwrap();
-        let slower = LaneDemand {
-            max_rate_hz: Some(5.0),
-            ..to(&robot)
-        };
+        let slower = LaneDemand { max_rate_hz: Some(5.0), ..to(&robot) };
         let demands = [
             demand("map", 1_000_000, 10.0, vec![to(&robot)]),
             demand("stop", 1_000, 10.0, vec![to(&robot)]),
@@ -339,10 +329,7 @@ mod tests {
             process: 100e6,
             flows: BTreeMap::from([(
                 robot.clone(),
-                FlowBudget {
-                    bytes_per_s: 100.0,
-                    passing: true,
-                },
+                FlowBudget { bytes_per_s: 100.0, passing: true },
             )]),
             ..Budgets::default()
         };

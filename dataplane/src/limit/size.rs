@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-/// The largest size of late. It is remembered for ever, as in the paper, or for a while, so that one outlier does not lower the rate of
-/// its topic until the flow is started again.
+/// The largest size of late. It is remembered for ever, as in the paper, or for a while, so that
+/// one outlier does not lower the rate of its topic until the flow is started again.
 #[derive(Debug, Clone, Default)]
 pub struct SizeMeter {
     /// Of the current window and the one before; without a window all is in the first.
@@ -26,8 +26,9 @@ impl SizeMeter {
         self.largest[0].max(self.largest[1])
     }
 
-    /// Lets go of what is older than the window, at most two of them. Returns whether the largest is another one now. To be called now and
-    /// then; without messages of late the last ones count on.
+    /// Lets go of what is older than the window, at most two of them. Returns whether the largest
+    /// is another one now. To be called now and then; without messages of late the last ones count
+    /// on.
     pub fn forget(&mut self, now: Instant, window: Option<Duration>) -> bool {
         let Some((window, begun)) = window.zip(self.begun) else {
             return false;

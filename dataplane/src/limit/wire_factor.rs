@@ -1,17 +1,17 @@
 //! How much more the wire carries than `s · α`: the wire factor ω of F9, measured.
 //!
-//! What leaves is user messages with their headers, chunks and repairs, and the link's own control messages. The first grows with what is
-//! sent, the second does not. So both are measured apart:
+//! What leaves is user messages with their headers, chunks and repairs, and the link's own control
+//! messages. The first grows with what is sent, the second does not. So both are measured apart:
 //!
 //! ```text
 //! allocation runs on  (B · given out − control) / ω_user  =  B / ω,    ω_user = wire bytes of user messages / Σ s·α
 //! ```
 //!
-//! `s` is the largest size of a topic, of which each message counts as much, however small it was: where sizes vary ω is below 1, and the
-//! rates that come of it use up the limit.
+//! `s` is the largest size of a topic, of which each message counts as much, however small it was:
+//! where sizes vary ω is below 1, and the rates that come of it use up the limit.
 //!
-//! With a single quotient of all bytes a flow that has sent next to nothing would take Hellos for the cost of messages, and give a camera
-//! that begins a tenth of the link.
+//! With a single quotient of all bytes a flow that has sent next to nothing would take Hellos for
+//! the cost of messages, and give a camera that begins a tenth of the link.
 
 use std::time::{Duration, Instant};
 
@@ -23,10 +23,11 @@ pub const MAX_LAYERS: usize = 1_024;
 const TAU: Duration = Duration::from_secs(5);
 /// Fewer bytes of `s` than this, over the time constant, tell nothing of what messages cost.
 const ENOUGH_BYTES: f64 = 16_384.0;
-/// The factor before anything was measured: what images cost, 1,376 bytes in each packet for 1,232 of them.
+/// The factor before anything was measured: what images cost, 1,376 bytes in each packet for 1,232
+/// of them.
 pub const FIRST: f64 = 1.1;
-/// Bounds of what is believed of the cost of messages. Messages of a few bytes cost more than ten times their size; those of a topic whose
-/// largest was an outlier cost next to nothing of it.
+/// Bounds of what is believed of the cost of messages. Messages of a few bytes cost more than ten
+/// times their size; those of a topic whose largest was an outlier cost next to nothing of it.
 const BELIEVED: (f64, f64) = (0.01, 50.0);
 /// Of the limit so much is left for messages at least, however much the link says itself.
 const LEAST_SHARE: f64 = 0.1;
@@ -38,7 +39,8 @@ pub struct Totals {
     pub user_wire: u64,
     /// Wire bytes of all others.
     pub control_wire: u64,
-    /// `Σ s` of the messages that were sent, each copy counted once, and of those that are being sent the part that has left.
+    /// `Σ s` of the messages that were sent, each copy counted once, and of those that are being
+    /// sent the part that has left.
     pub reckoned: u64,
 }
 
@@ -60,20 +62,23 @@ impl WireFactor {
             return;
         };
         let elapsed = now.saturating_duration_since(at).as_secs_f64();
-        let went_back = totals.user_wire < before.user_wire || totals.control_wire < before.control_wire;
+        let went_back =
+            totals.user_wire < before.user_wire || totals.control_wire < before.control_wire;
         if elapsed <= 0.0 || went_back {
             return;
         }
         let keeps = (-elapsed / TAU.as_secs_f64()).exp();
         self.user_wire = self.user_wire * keeps + (totals.user_wire - before.user_wire) as f64;
-        // A little less than before where the size of a topic has just become smaller, of which a message is being sent.
+        // A little less than before where the size of a topic has just become smaller, of which a
+        // message is being sent.
         let reckoned = totals.reckoned as f64 - before.reckoned as f64;
         self.reckoned = (self.reckoned * keeps + reckoned).max(0.0);
         let control = (totals.control_wire - before.control_wire) as f64 / elapsed;
         self.control = self.control * keeps + control * (1.0 - keeps);
     }
 
-    /// `ω_user`: wire bytes of messages per byte of `s · α`; `None` while too little was sent to tell.
+    /// `ω_user`: wire bytes of messages per byte of `s · α`; `None` while too little was sent to
+    /// tell.
     #[must_use]
     pub fn of_messages(&self, overhead: f64) -> Option<f64> {
         let measured = self.user_wire / (self.reckoned * overhead.max(1.0));
@@ -87,7 +92,8 @@ impl WireFactor {
     }
 }
 
-/// What a limit in wire bytes per second leaves for `s · α`, in bytes per second. Divided into the limit it gives ω.
+/// What a limit in wire bytes per second leaves for `s · α`, in bytes per second. Divided into the
+/// limit it gives ω.
 #[must_use]
 pub fn budget(limit_bytes_per_s: f64, control_bytes_per_s: f64, of_messages: f64) -> f64 {
     let limit = limit_bytes_per_s.max(0.0);
@@ -142,11 +148,8 @@ mod tests {
         let mut factor = WireFactor::default();
         let (mut user_wire, mut reckoned, mut wire_of_second) = (0.0f64, 0.0f64, 0.0f64);
         for second in 0..60u32 {
-            let totals = Totals {
-                user_wire: user_wire as u64,
-                control_wire: 0,
-                reckoned: reckoned as u64,
-            };
+            let totals =
+                Totals { user_wire: user_wire as u64, control_wire: 0, reckoned: reckoned as u64 };
             factor.sample(start + SECOND * second, totals);
             let of_messages = factor.of_messages(1.02).unwrap_or(FIRST);
             let hz = budget(LIMIT, factor.control_bytes_per_s(), of_messages) / (100_000.0 * 1.02);
@@ -164,13 +167,7 @@ mod tests {
         let mut factor = after_a_minute(1_122_000, 0, 1_000_000);
         let before = factor.of_messages(1.02).unwrap();
         factor.sample(start + SECOND * 100, Totals::default());
-        factor.sample(
-            start + SECOND * 100,
-            Totals {
-                reckoned: 9,
-                ..Totals::default()
-            },
-        );
+        factor.sample(start + SECOND * 100, Totals { reckoned: 9, ..Totals::default() });
         assert!((factor.of_messages(1.02).unwrap() - before).abs() < 1e-9);
         assert!(budget(f64::MIN, 0.0, FIRST).abs() < 1e-9);
     }
@@ -178,6 +175,8 @@ mod tests {
     #[test]
     fn control_messages_never_take_all() {
         let factor = after_a_minute(0, 1_000_000, 0);
-        assert!((budget(1_000.0, factor.control_bytes_per_s(), FIRST) - 100.0 / FIRST).abs() < 1e-9);
+        assert!(
+            (budget(1_000.0, factor.control_bytes_per_s(), FIRST) - 100.0 / FIRST).abs() < 1e-9
+        );
     }
 }

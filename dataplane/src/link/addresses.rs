@@ -71,9 +71,8 @@ mod tests {
     fn every_address_gets_its_turn() {
         let mut addresses = Addresses::default();
         addresses.set_own(vec!["10.0.0.1".into()]);
-        let told: Vec<Vec<String>> = (0..3)
-            .map(|batch| (0..15).map(|at| format!("10.1.{batch}.{at}")).collect())
-            .collect();
+        let told: Vec<Vec<String>> =
+            (0..3).map(|batch| (0..15).map(|at| format!("10.1.{batch}.{at}")).collect()).collect();
         for batch in &told {
             assert_eq!(addresses.learn(batch).len(), 15);
             assert!(addresses.learn(batch).is_empty(), "known by now");
@@ -85,10 +84,6 @@ mod tests {
             seen.extend(hello);
         }
         assert_eq!(seen.len(), 46);
-        assert!(
-            addresses
-                .learn(&["x".repeat(65), String::new(), "a b".into()])
-                .is_empty()
-        );
+        assert!(addresses.learn(&["x".repeat(65), String::new(), "a b".into()]).is_empty());
     }
 }

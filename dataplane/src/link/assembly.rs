@@ -30,7 +30,12 @@ pub(crate) struct Assembly {
 }
 
 impl Assembly {
-    pub(crate) fn new(first: &Record, now: Instant, half_round_trip: Duration, active: Duration) -> Self {
+    pub(crate) fn new(
+        first: &Record,
+        now: Instant,
+        half_round_trip: Duration,
+        active: Duration,
+    ) -> Self {
         Self {
             buffer: BytesMut::zeroed(first.total as usize),
             ranges: Vec::new(),
@@ -70,7 +75,13 @@ impl Assembly {
     }
 
     /// Takes a part. Returns whether it is one of this message.
-    pub(crate) fn take(&mut self, record: &Record, bytes: &[u8], now: Instant, active: Duration) -> bool {
+    pub(crate) fn take(
+        &mut self,
+        record: &Record,
+        bytes: &[u8],
+        now: Instant,
+        active: Duration,
+    ) -> bool {
         let (start, end) = (record.offset as usize, record.offset as usize + bytes.len());
         if record.total as usize != self.total() || end > self.total() {
             return false;
@@ -87,7 +98,8 @@ impl Assembly {
         true
     }
 
-    /// Topic and lifespan, where the first part holds the whole header, which it does unless that is very long.
+    /// Topic and lifespan, where the first part holds the whole header, which it does unless that
+    /// is very long.
     fn read_header(&mut self, record: &Record, bytes: &[u8]) {
         let Ok(length) = Frame::head_length(bytes) else { return };
         let Some(head) = bytes.get(..length) else { return };
@@ -131,16 +143,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn record(total: u32, offset: u32, length: u32) -> Record {
-        Record {
-            message: 1,
-            total,
-            offset,
-            length,
-            hops: 1,
-            flags: 0,
-            behind: 0,
-            age_us: 0,
-        }
+        Record { message: 1, total, offset, length, hops: 1, flags: 0, behind: 0, age_us: 0 }
     }
 
     proptest! {
@@ -151,12 +154,20 @@ mod tests {
             let total = 2_000;
             let now = Instant::now();
             let whole: Vec<u8> = (0..total).map(|at| u8::try_from(at % 253).unwrap()).collect();
-            let mut assembly = Assembly::new(&record(total, 0, 1), now, Duration::ZERO, Duration::ZERO);
+            let mut assembly =
+                Assembly::new(&record(total, 0, 1), now, Duration::ZERO, Duration::ZERO);
             let mut truth = vec![false; total as usize];
             for (offset, length) in parts {
                 let length = length.min(total - offset);
                 let place = offset as usize..(offset + length) as usize;
-                prop_assert!(assembly.take(&record(total, offset, length), &whole[place.clone()], now, Duration::ZERO));
+                prop_assert!(
+                    assembly.take(
+                        &record(total, offset, length),
+                        &whole[place.clone()],
+                        now,
+                        Duration::ZERO,
+                    ),
+                );
                 truth[place].fill(true);
                 let known = truth.iter().filter(|known| **known).count();
                 prop_assert_eq!(assembly.missing_bytes(), total as usize - known);
@@ -164,7 +175,9 @@ mod tests {
             for (at, known) in truth.iter().enumerate().filter(|(_, known)| **known) {
                 prop_assert!(*known && assembly.buffer[at] == whole[at]);
             }
-            prop_assert!(!assembly.take(&record(total + 1, 0, 300), &whole[..300], now, Duration::ZERO));
+            prop_assert!(
+                !assembly.take(&record(total + 1, 0, 300), &whole[..300], now, Duration::ZERO),
+            );
         }
     }
 }

@@ -1,7 +1,8 @@
 //! What may go to each peer: the limit of its layer, and what its link was seen to carry.
 //!
-//! The pacer of the process keeps the limit of all links together; these keep that of a single one, so that a slow destination makes
-//! only its own messages wait. LinkControl is never held back: it may put a link into debt, which messages then wait off.
+//! The pacer of the process keeps the limit of all links together; these keep that of a single one,
+//! so that a slow destination makes only its own messages wait. LinkControl is never held back: it
+//! may put a link into debt, which messages then wait off.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -101,11 +102,13 @@ impl Budgets {
     }
 
     /// Whether a peer of the layer may be sent to; else it is noted when.
-    pub(crate) fn may_send(&mut self, now: Instant, layer: &LayerName, path: &mut PathBudget) -> bool {
-        let of_layer = self
-            .layers
-            .get_mut(layer)
-            .map_or(Duration::ZERO, |pacer| pacer.wait(now));
+    pub(crate) fn may_send(
+        &mut self,
+        now: Instant,
+        layer: &LayerName,
+        path: &mut PathBudget,
+    ) -> bool {
+        let of_layer = self.layers.get_mut(layer).map_or(Duration::ZERO, |pacer| pacer.wait(now));
         let wait = of_layer.max(path.wait(now));
         if wait.is_zero() {
             return true;
@@ -116,7 +119,13 @@ impl Budgets {
     }
 
     /// Counts a datagram that leaves.
-    pub(crate) fn spend(&mut self, now: Instant, layer: &LayerName, path: &mut PathBudget, datagram_bytes: usize) {
+    pub(crate) fn spend(
+        &mut self,
+        now: Instant,
+        layer: &LayerName,
+        path: &mut PathBudget,
+        datagram_bytes: usize,
+    ) {
         let Some(packets) = self.packets() else { return };
         let wire_bytes = packets.wire_bytes(datagram_bytes);
         if let Some(pacer) = self.layers.get_mut(layer) {
@@ -126,7 +135,13 @@ impl Budgets {
     }
 
     /// Nothing is to be sent to a peer; `of_layer`: nor to any other of its layer.
-    pub(crate) fn rest(&mut self, now: Instant, layer: &LayerName, path: &mut PathBudget, of_layer: bool) {
+    pub(crate) fn rest(
+        &mut self,
+        now: Instant,
+        layer: &LayerName,
+        path: &mut PathBudget,
+        of_layer: bool,
+    ) {
         if of_layer && let Some(pacer) = self.layers.get_mut(layer) {
             pacer.rest(now);
         }
@@ -141,7 +156,13 @@ impl Budgets {
     }
 
     /// Makes a peer's budget as it is set now.
-    pub(crate) fn fit(&self, now: Instant, layer: &LayerName, max_datagram: usize, path: &mut PathBudget) {
+    pub(crate) fn fit(
+        &self,
+        now: Instant,
+        layer: &LayerName,
+        max_datagram: usize,
+        path: &mut PathBudget,
+    ) {
         let adaptive = self.set.as_ref().filter(|set| set.adaptive);
         match adaptive.zip(self.limit(layer)) {
             Some((set, limit)) => path.adapt(now, limit, burst_bytes(set.packets, max_datagram)),
@@ -178,10 +199,7 @@ impl PathBudget {
             None => {
                 let mut capacity = Capacity::new(limit, now);
                 capacity.set_needed(self.needed, now);
-                self.follow = Some(Follow {
-                    capacity,
-                    pacer: Pacer::new(limit, burst_bytes, now),
-                });
+                self.follow = Some(Follow { capacity, pacer: Pacer::new(limit, burst_bytes, now) });
             }
         }
         self.pace(now);
@@ -203,9 +221,7 @@ impl PathBudget {
     }
 
     fn wait(&mut self, now: Instant) -> Duration {
-        self.follow
-            .as_mut()
-            .map_or(Duration::ZERO, |follow| follow.pacer.wait(now))
+        self.follow.as_mut().map_or(Duration::ZERO, |follow| follow.pacer.wait(now))
     }
 
     fn spend(&mut self, now: Instant, wire_bytes: usize) {
@@ -287,11 +303,7 @@ mod tests {
         const SECOND: Duration = Duration::from_secs(1);
         let start = Instant::now();
         let cloud: LayerName = "cloud".parse().unwrap();
-        let narrow = PacketSize {
-            whole_header: 0,
-            prefix: 0,
-            ..PACKETS
-        };
+        let narrow = PacketSize { whole_header: 0, prefix: 0, ..PACKETS };
         // The limit is that of the layer, and then that of the path.
         for (layers, adaptive) in [(&[(&cloud, 1e6)][..], false), (&[][..], true)] {
             let (mut link, mut path) = (Budgets::default(), PathBudget::default());

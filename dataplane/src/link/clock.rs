@@ -23,10 +23,7 @@ pub(crate) struct Clocks {
 
 impl Clocks {
     pub(crate) fn new(now: Instant, wall_ns: u64) -> Self {
-        Self {
-            start: now,
-            wall_at_start: i128::from(wall_ns),
-        }
+        Self { start: now, wall_at_start: i128::from(wall_ns) }
     }
 
     pub(crate) fn set_wall(&mut self, now: Instant, wall_ns: u64) {
@@ -57,8 +54,15 @@ pub(crate) struct RoundTrip {
 }
 
 impl RoundTrip {
-    /// Takes a measurement: the echoed send time and how long the peer held it, both in nanoseconds.
-    pub(crate) fn echo(&mut self, now: Instant, now_ns: u64, sent_ns: u64, held_ns: u64) -> Option<Duration> {
+    /// Takes a measurement: the echoed send time and how long the peer held it, both in
+    /// nanoseconds.
+    pub(crate) fn echo(
+        &mut self,
+        now: Instant,
+        now_ns: u64,
+        sent_ns: u64,
+        held_ns: u64,
+    ) -> Option<Duration> {
         let elapsed = now_ns.checked_sub(sent_ns)?.checked_sub(held_ns)?;
         let sample = Duration::from_nanos(elapsed);
         if sent_ns == 0 || sample > LONGEST_ROUND_TRIP {
@@ -71,7 +75,9 @@ impl RoundTrip {
         });
         self.minimum = Some(match self.minimum {
             None => (now, sample, sample),
-            Some((since, current, _)) if now.saturating_duration_since(since) > MINIMUM_HOLDS => (now, sample, current),
+            Some((since, current, _)) if now.saturating_duration_since(since) > MINIMUM_HOLDS => {
+                (now, sample, current)
+            }
             Some((since, current, previous)) => (since, current.min(sample), previous),
         });
         Some(sample)
@@ -102,15 +108,12 @@ pub(crate) struct ClockOffset {
 }
 
 impl ClockOffset {
-    /// Takes the four times of an exchange (RFC 5905, section 8) that took `round_trip`, as a Hello brings them.
+    /// Takes the four times of an exchange (RFC 5905, section 8) that took `round_trip`, as a Hello
+    /// brings them.
     pub(crate) fn exchange(&mut self, clock: &Clock, wall_now_ns: u64, round_trip: Duration) {
-        let [t1, t2, t3, t4] = [
-            clock.echo_received_wall_ns,
-            clock.echo_wall_ns,
-            clock.sent_wall_ns,
-            wall_now_ns,
-        ]
-        .map(i128::from);
+        let [t1, t2, t3, t4] =
+            [clock.echo_received_wall_ns, clock.echo_wall_ns, clock.sent_wall_ns, wall_now_ns]
+                .map(i128::from);
         let Ok(offset) = i64::try_from(((t2 - t1) + (t3 - t4)) / 2) else {
             return;
         };

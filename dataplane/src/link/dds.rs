@@ -5,10 +5,10 @@
 //! connect / disconnect ──► wanted writers ──► lifecycle thread makes and drops them
 //! ```
 //!
-//! A flow reads three topics of its own, `blaze/link/<layer>/<node>/<epoch>/<class>`. Others find them by discovery and
-//! write to them, best effort: the link repairs itself, and a lost packet must hold back nobody. One thread
-//! (`lifecycle`) owns the participant, makes all writers, tells the relay which hosts answer, and builds everything
-//! anew with a new epoch when RustDDS dies.
+//! A flow reads three topics of its own, `blaze/link/<layer>/<node>/<epoch>/<class>`. Others find
+//! them by discovery and write to them, best effort: the link repairs itself, and a lost packet
+//! must hold back nobody. One thread (`lifecycle`) owns the participant, makes all writers, tells
+//! the relay which hosts answer, and builds everything anew with a new epoch when RustDDS dies.
 
 mod lifecycle;
 mod wire;
@@ -38,7 +38,8 @@ const MAX_HEARD: usize = 1024;
 const TOPIC_PREFIX: &str = "blaze/link/";
 const CLASSES: usize = Priority::ALL.len();
 
-/// Called with everything that happens. It runs in the threads of the transport and must not wait for long.
+/// Called with everything that happens. It runs in the threads of the transport and must not wait
+/// for long.
 pub type EventSink = Arc<dyn Fn(TransportEvent) + Send + Sync>;
 
 /// What a [`DdsTransport`] needs to know.
@@ -75,14 +76,15 @@ pub struct DdsStatus {
     pub detail: String,
     /// How often RustDDS died and was built anew.
     pub rebuilds: u64,
-    /// Dead participants whose threads have not ended: they hang, and may hold or take memory until the process ends.
+    /// Dead participants whose threads have not ended: they hang, and may hold or take memory until
+    /// the process ends.
     pub remains: usize,
     /// Datagrams that were not handed to the network: no writer, no reader there yet, or too large.
     pub not_sent: u64,
     /// Datagrams of readers that were not a sequence of octets.
     pub malformed: u64,
-    /// Datagrams that the kernel dropped at the receive sockets: hostile ones, and those for which no room was left.
-    /// Counted once a second.
+    /// Datagrams that the kernel dropped at the receive sockets: hostile ones, and those for which
+    /// no room was left. Counted once a second.
     pub dropped_by_kernel: u64,
     /// Endpoints of other flows that can be written to.
     pub endpoints: usize,
@@ -153,10 +155,7 @@ impl DdsTransport {
             config,
         });
         let thread = lifecycle::start(Arc::clone(&shared))?;
-        Ok(Self {
-            shared,
-            thread: Some(thread),
-        })
+        Ok(Self { shared, thread: Some(thread) })
     }
 
     /// What it says of itself.
@@ -172,8 +171,11 @@ impl DdsTransport {
             details.push(std::mem::take(&mut status.detail));
         }
         if relay.announces_multicast {
-            details
-                .push("multicast addresses are announced, since another program holds the ports of the domain".into());
+            details.push(
+                "multicast addresses are announced, since another program holds the ports of \
+                    the domain"
+                    .into(),
+            );
         }
         if !relay.listening {
             details.push("no free participant slot: other hosts are not told of this flow".into());
@@ -251,11 +253,10 @@ impl DdsTransport {
         self.wake();
     }
 
-    /// Other hosts where flows may be, as learnt from other flows; in the form of [`DdsTransport::addresses`].
+    /// Other hosts where flows may be, as learnt from other flows; in the form of
+    /// [`DdsTransport::addresses`].
     pub fn learn_addresses(&self, addresses: &[String]) {
-        self.shared
-            .relay
-            .learn(addresses.iter().filter_map(|address| address.parse().ok()));
+        self.shared.relay.learn(addresses.iter().filter_map(|address| address.parse().ok()));
     }
 
     /// The addresses where this flow can be found.
@@ -264,7 +265,8 @@ impl DdsTransport {
         vec![self.shared.address.to_string()]
     }
 
-    /// Bytes that a datagram of that length takes on the wire: Ethernet payload, that is IP packets with their headers.
+    /// Bytes that a datagram of that length takes on the wire: Ethernet payload, that is IP packets
+    /// with their headers.
     #[must_use]
     pub fn wire_bytes(&self, datagram_bytes: usize) -> usize {
         self.shared.wire.bytes(datagram_bytes)
@@ -302,8 +304,8 @@ fn parse_topic(topic: &str) -> Option<(Endpoint, Priority)> {
     parts.next().is_none().then_some((Endpoint { flow, epoch }, class))
 }
 
-/// Room for a class in writers and readers: enough for the event loop's and the sink's pauses, bounded in bytes, since
-/// RustDDS keeps that many samples whether they wait or not.
+/// Room for a class in writers and readers: enough for the event loop's and the sink's pauses,
+/// bounded in bytes, since RustDDS keeps that many samples whether they wait or not.
 fn profile(class: Priority, datagram_bytes: usize) -> Profile {
     let bytes = match class {
         Priority::Control => 256 << 10,

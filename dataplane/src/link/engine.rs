@@ -23,7 +23,9 @@ use prost::Message as _;
 use super::addresses::Addresses;
 use super::budget::{Budgets, LinkBudgets, LinkCapacity};
 use super::clock::Clocks;
-use super::event::{Begun, LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
+use super::event::{
+    Begun, LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit,
+};
 use super::lifecycle::Missed;
 use super::peer::{HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
 use super::sender::SendClass;
@@ -32,17 +34,19 @@ use super::wire::{HEADER_BYTES, RECORD_BYTES, SenderId};
 
 /// Smallest datagram size that an engine uses, in bytes.
 pub const MIN_DATAGRAM_BYTES: usize = 1024;
-/// Peers of one flow, at most. Each takes six file descriptors (RustDDS has two per writer), twelve for as long as a dead
-/// participant is laid aside, up to 3.3 MiB in DDS, and a look at each datagram that is sent; and all flows know all writers of all.
+/// Peers of one flow, at most. Each takes six file descriptors (RustDDS has two per writer), twelve
+/// for as long as a dead participant is laid aside, up to 3.3 MiB in DDS, and a look at each
+/// datagram that is sent; and all flows know all writers of all.
 pub const MAX_PEERS: usize = 128;
-/// Flows that are remembered as heard when they have no place any more; beyond that those that went first are forgotten.
+/// Flows that are remembered as heard when they have no place any more; beyond that those that went
+/// first are forgotten.
 const MAX_HEARD: NonZeroUsize = NonZeroUsize::new(8 * MAX_PEERS).unwrap();
 
 /// Bounds of an engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Bytes per destination and class (control, state, bulk) that wait, and as many again that were sent and may have to
-    /// be repaired; one message always fits besides.
+    /// Bytes per destination and class (control, state, bulk) that wait, and as many again that
+    /// were sent and may have to be repaired; one message always fits besides.
     pub queue_bytes: [usize; 3],
     /// Bytes of unfinished and waiting messages of all peers.
     pub reassembly_bytes: usize,
@@ -97,7 +101,8 @@ pub struct Engine {
     pub(super) by_sender: HashMap<SenderId, usize>,
     /// Flows that were heard before a new life began, here or there, and not since.
     pub(super) missed: BTreeMap<FlowId, Missed>,
-    /// Flows that were heard in a place that they have no more: what their links carry has to be found out from below when they come back.
+    /// Flows that were heard in a place that they have no more: what their links carry has to be
+    /// found out from below when they come back.
     pub(super) heard: LruCache<FlowId, ()>,
     /// Flows that found no place, those first that wait longest.
     pub(super) waiting: VecDeque<Endpoint>,
@@ -116,10 +121,8 @@ impl Engine {
     /// An engine without peers. `wall_ns` is the time since 1970 at `now`.
     #[must_use]
     pub fn new(config: EngineConfig, now: Instant, wall_ns: u64) -> Self {
-        let config = EngineConfig {
-            max_datagram: config.max_datagram.max(MIN_DATAGRAM_BYTES),
-            ..config
-        };
+        let config =
+            EngineConfig { max_datagram: config.max_datagram.max(MIN_DATAGRAM_BYTES), ..config };
         Self {
             clocks: Clocks::new(now, wall_ns),
             sender: SenderId::of(&config.me, config.epoch),
@@ -148,10 +151,7 @@ impl Engine {
     /// The own endpoint: flow and life.
     #[must_use]
     pub fn endpoint(&self) -> Endpoint {
-        Endpoint {
-            flow: self.config.me.clone(),
-            epoch: self.config.epoch,
-        }
+        Endpoint { flow: self.config.me.clone(), epoch: self.config.epoch }
     }
 
     /// Tells the wall clock anew, in nanoseconds since 1970.
@@ -208,7 +208,8 @@ impl Engine {
         }
     }
 
-    /// What is small needs so many wire bytes per second to each flow; to those that are not named nothing.
+    /// What is small needs so many wire bytes per second to each flow; to those that are not named
+    /// nothing.
     pub fn set_needed(&mut self, now: Instant, wire_bytes_per_s: &BTreeMap<FlowId, f64>) {
         for peer in self.peers.iter_mut().flatten() {
             let needed = wire_bytes_per_s.get(&peer.endpoint.flow).copied();
@@ -225,13 +226,15 @@ impl Engine {
             .collect()
     }
 
-    /// Messages of which some parts have left and others have not: at most one of each class and peer.
+    /// Messages of which some parts have left and others have not: at most one of each class and
+    /// peer.
     pub fn begun(&self) -> impl Iterator<Item = (LaneId, Begun)> {
         let classes = self.peers.iter().flatten().flat_map(|peer| &peer.send);
         classes.filter_map(SendClass::begun)
     }
 
-    /// When a peer may be sent to for which [`Engine::poll_transmit`] has something and its link no budget.
+    /// When a peer may be sent to for which [`Engine::poll_transmit`] has something and its link no
+    /// budget.
     #[must_use]
     pub fn paced_until(&self) -> Option<Instant> {
         self.budgets.paced_until
@@ -245,12 +248,12 @@ impl Engine {
     }
 
     /// Takes a message for a peer. From then on it ends in exactly one [`LinkEvent::LaneOut`] or
-    /// [`LinkEvent::LaneDropped`], or in what [`Engine::drop_lane`] returns. Older ones that wait give way if the queue is
-    /// full.
+    /// [`LinkEvent::LaneDropped`], or in what [`Engine::drop_lane`] returns. Older ones that wait
+    /// give way if the queue is full.
     ///
     /// # Errors
-    /// The reason why it was not taken, for the caller to count: `no_destination` (the flow is not known), `link_down` (it
-    /// is not up), `lifespan` (too old already).
+    /// The reason why it was not taken, for the caller to count: `no_destination` (the flow is not
+    /// known), `link_down` (it is not up), `lifespan` (too old already).
     pub fn submit(&mut self, now: Instant, submit: Submit<'_>) -> Result<(), DropReason> {
         let at = *self.by_flow.get(submit.to).ok_or(DropReason::NoDestination)?;
         let peer = self.peers[at].as_ref().ok_or(DropReason::NoDestination)?;
@@ -276,11 +279,8 @@ impl Engine {
         let Some(layer) = self.peers[at].as_ref().map(|peer| &peer.endpoint.flow.layer) else {
             return;
         };
-        let mut of_layer = self
-            .peers
-            .iter()
-            .flatten()
-            .filter(|peer| peer.endpoint.flow.layer == *layer);
+        let mut of_layer =
+            self.peers.iter().flatten().filter(|peer| peer.endpoint.flow.layer == *layer);
         let rests = self.budgets.has_limit(layer) && !of_layer.any(Peer::has_work);
         if let Some(peer) = &mut self.peers[at] {
             self.budgets.rest(now, &peer.endpoint.flow.layer, &mut peer.path, rests);
@@ -330,7 +330,8 @@ impl Engine {
         peers.chain(missed.map(|(_, missed)| missed.until)).min()
     }
 
-    /// Drops what a lane has waiting; what is on its way goes on and ends in an event. The caller counts what is returned.
+    /// Drops what a lane has waiting; what is on its way goes on and ends in an event. The caller
+    /// counts what is returned.
     pub fn drop_lane(&mut self, lane: LaneId) -> Tally {
         let mut dropped = Tally::default();
         for class in self.peers.iter_mut().flatten().flat_map(|peer| &mut peer.send) {
@@ -396,16 +397,16 @@ impl Engine {
         hello.is_some_and(|hello| hello.takes_lz4)
     }
 
-    /// Whether the queue of a class to a flow is empty, or takes so many bytes more and is at most half full then. Of a flow that
-    /// cannot be written to: yes, as nothing waits for it.
+    /// Whether the queue of a class to a flow is empty, or takes so many bytes more and is at most
+    /// half full then. Of a flow that cannot be written to: yes, as nothing waits for it.
     #[must_use]
     pub fn has_room(&self, flow: &FlowId, class: Priority, bytes: usize) -> bool {
         let peer = self.known(flow).filter(|peer| peer.is_connected());
         peer.is_none_or(|peer| peer.send[class as usize].has_room(bytes))
     }
 
-    /// The next datagram, most urgent first: LinkControl and probes, then control, state and bulk, each in turn over the
-    /// peers. `None`: nothing to send now.
+    /// The next datagram, most urgent first: LinkControl and probes, then control, state and bulk,
+    /// each in turn over the peers. `None`: nothing to send now.
     pub fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
         self.poll_control(now)
             .or_else(|| self.transmit_messages(now))

@@ -44,8 +44,9 @@ pub struct Submit<'a> {
     pub reliable: bool,
     /// Age (that of the frame included) at which it is of no use; `None` = never.
     pub lifespan: Option<Duration>,
-    /// At most this many of its lane and stream wait unstarted, itself included: older ones give way, so that a link
-    /// that is too slow for a topic carries its newest messages and not its oldest. 0 = only bytes count.
+    /// At most this many of its lane and stream wait unstarted, itself included: older ones give
+    /// way, so that a link that is too slow for a topic carries its newest messages and not its
+    /// oldest. 0 = only bytes count.
     pub keep_newest: usize,
 }
 
@@ -94,7 +95,8 @@ pub enum LinkEvent {
         /// What it says.
         body: Body,
     },
-    /// A peer asks whether all of a topic that came over the link is with the brokers that it is for.
+    /// A peer asks whether all of a topic that came over the link is with the brokers that it is
+    /// for.
     WrittenAsked {
         /// The flow that asks.
         from: FlowId,
@@ -138,7 +140,8 @@ pub enum LinkEvent {
     },
     /// A peer that was down is not waited for any more.
     PeerForgotten(Endpoint),
-    /// The engine holds nothing of this life of a peer any more: what the transport has for it can go.
+    /// The engine holds nothing of this life of a peer any more: what the transport has for it can
+    /// go.
     PeerRemoved(Endpoint),
     /// There was no place for a flow; told once in a while, however many there are.
     PeerRefused {
@@ -151,7 +154,8 @@ pub enum LinkEvent {
     PeerAdmitted(Endpoint),
     /// Addresses that were not known before.
     Addresses(Vec<String>),
-    /// The last byte of a message was sent for the first time: for rates. Each message has at most one of these.
+    /// The last byte of a message was sent for the first time: for rates. Each message has at most
+    /// one of these.
     LaneSent {
         /// Its lane.
         lane: LaneId,
@@ -160,7 +164,8 @@ pub enum LinkEvent {
         /// Since it arrived at this flow.
         wait: Duration,
     },
-    /// A message has left for good: best-effort ones of one part when sent, others when they are known to have arrived.
+    /// A message has left for good: best-effort ones of one part when sent, others when they are
+    /// known to have arrived.
     LaneOut {
         /// Its lane.
         lane: LaneId,

@@ -11,10 +11,7 @@ pub(crate) struct Flights<T> {
 
 impl<T> Default for Flights<T> {
     fn default() -> Self {
-        Self {
-            waiting: BTreeMap::new(),
-            sent: 0,
-        }
+        Self { waiting: BTreeMap::new(), sent: 0 }
     }
 }
 

@@ -14,12 +14,14 @@ use super::wire::SenderId;
 
 /// Missed flows that are kept; beyond that the one that is due next is forgotten.
 const MAX_MISSED: usize = 1_024;
-/// Flows without a place that are kept, so that they get one when it is free; beyond that the oldest gives way.
+/// Flows without a place that are kept, so that they get one when it is free; beyond that the
+/// oldest gives way.
 const MAX_WAITING: usize = 256;
 /// How often it is told that a flow found no place.
 const REFUSAL_TOLD_EVERY: Duration = Duration::from_secs(60);
 
-/// A flow that was heard, until a new life began, here or there. Without this nobody would tell that it did not come back.
+/// A flow that was heard, until a new life began, here or there. Without this nobody would tell
+/// that it did not come back.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Missed {
     /// The life in which it was heard.
@@ -45,7 +47,8 @@ impl Engine {
         true
     }
 
-    /// The transport no longer sees an endpoint. One that says Hello stays; one that never did is forgotten.
+    /// The transport no longer sees an endpoint. One that says Hello stays; one that never did is
+    /// forgotten.
     pub fn peer_lost(&mut self, now: Instant, endpoint: &Endpoint) {
         self.waiting.retain(|waiting| waiting != endpoint);
         if let Some(&at) = self.by_flow.get(&endpoint.flow)
@@ -58,8 +61,8 @@ impl Engine {
         }
     }
 
-    /// The place of an endpoint, made if it is new; a newer life replaces an older one. `None`: an older life, this flow
-    /// itself, or no room.
+    /// The place of an endpoint, made if it is new; a newer life replaces an older one. `None`: an
+    /// older life, this flow itself, or no room.
     pub(super) fn place_of(&mut self, now: Instant, endpoint: Endpoint) -> Option<usize> {
         if endpoint.flow == self.config.me {
             return None;
@@ -85,7 +88,8 @@ impl Engine {
             streams: self.config.limits.streams,
             max_datagram: self.config.max_datagram,
         });
-        let mut peer = Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
+        let mut peer =
+            Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
         peer.was_heard = self.heard.pop(&peer.endpoint.flow).is_some();
         let layer = &peer.endpoint.flow.layer;
         self.budgets.fit(now, layer, self.config.max_datagram, &mut peer.path);
@@ -116,7 +120,8 @@ impl Engine {
         Some(at)
     }
 
-    /// Notes a flow that found no place. It will not be found a second time, and stops saying Hello if it gets no answer.
+    /// Notes a flow that found no place. It will not be found a second time, and stops saying Hello
+    /// if it gets no answer.
     fn refuse(&mut self, now: Instant, endpoint: Endpoint) {
         let told = self.refusal_told;
         if told.is_none_or(|told| now.saturating_duration_since(told) >= REFUSAL_TOLD_EVERY) {
@@ -151,8 +156,8 @@ impl Engine {
         self.peers.len() < self.config.limits.peers || self.peers.iter().any(Option::is_none)
     }
 
-    /// This flow begins a new life: peers are dropped and have to be found again. Those that are not heard again are forgotten as
-    /// if it had gone on.
+    /// This flow begins a new life: peers are dropped and have to be found again. Those that are
+    /// not heard again are forgotten as if it had gone on.
     pub fn restart(&mut self, now: Instant, epoch: u64) {
         // The transport finds all of them anew.
         self.waiting.clear();
@@ -208,7 +213,8 @@ impl Engine {
     /// Forgets the missed flows that did not come back in time.
     fn forget_silent(&mut self, now: Instant) {
         let missed = self.missed.iter();
-        let due = missed.filter(|(flow, missed)| missed.until <= now && !self.by_flow.contains_key(*flow));
+        let due = missed
+            .filter(|(flow, missed)| missed.until <= now && !self.by_flow.contains_key(*flow));
         let due: Vec<FlowId> = due.map(|(flow, _)| flow.clone()).collect();
         for flow in due {
             self.forget_missed(flow);
@@ -293,9 +299,9 @@ impl Engine {
             }
         } else if peer.suspect_at().is_some_and(|suspect| suspect <= now) {
             peer.phase = Phase::Suspect;
-            self.ledger.events.push_back(LinkEvent::PeerSuspect {
-                flow: peer.endpoint.flow.clone(),
-            });
+            self.ledger
+                .events
+                .push_back(LinkEvent::PeerSuspect { flow: peer.endpoint.flow.clone() });
         }
     }
 

@@ -41,7 +41,8 @@ mod tests;
 pub use budget::{LinkBudgets, LinkCapacity, PacketSize};
 pub use engine::{Engine, EngineConfig, Limits, MAX_PEERS, MIN_DATAGRAM_BYTES};
 pub use event::{
-    Begun, DownReason, LaneId, LinkCounters, LinkEvent, PeerInfo, PeerState, StreamKey, Submit, Tally, Transmit,
+    Begun, DownReason, LaneId, LinkCounters, LinkEvent, PeerInfo, PeerState, StreamKey, Submit,
+    Tally, Transmit,
 };
 pub use wire::{HEADER_BYTES, RECORD_BYTES};
 pub(crate) use wire::{class_code, class_of, kind_from_wire, kind_to_wire};

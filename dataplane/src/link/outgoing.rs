@@ -191,10 +191,7 @@ impl Messages {
         let mut keys = Vec::new();
         for (at, (stamp, message)) in self.slots.iter().enumerate() {
             if message.as_ref().is_some_and(&mut wanted) {
-                keys.push(Key {
-                    at: u32::try_from(at).unwrap_or(u32::MAX),
-                    stamp: *stamp,
-                });
+                keys.push(Key { at: u32::try_from(at).unwrap_or(u32::MAX), stamp: *stamp });
             }
         }
         keys

@@ -146,7 +146,8 @@ impl Peer {
         })
     }
 
-    /// Drops what waits for it and begins new link epochs from `link_epoch` on. Returns the next unused one.
+    /// Drops what waits for it and begins new link epochs from `link_epoch` on. Returns the next
+    /// unused one.
     pub(crate) fn drop_outgoing(&mut self, link_epoch: u32, ledger: &mut Ledger) -> u32 {
         let newest = self.send.iter().map(SendClass::link_epoch).max().unwrap_or(0);
         let mut next = link_epoch.max(newest.saturating_add(1));

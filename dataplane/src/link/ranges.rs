@@ -90,7 +90,8 @@ mod tests {
                 }
                 prop_assert_eq!(ranges.last(), truth.last().copied());
                 let gaps: Vec<u64> = ranges.gaps(0).flat_map(|(from, to)| from..=to).collect();
-                let absent: Vec<u64> = (1..*truth.last().unwrap()).filter(|n| !truth.contains(n)).collect();
+                let absent: Vec<u64> =
+                    (1..*truth.last().unwrap()).filter(|n| !truth.contains(n)).collect();
                 prop_assert_eq!(gaps, absent);
                 let neighbours = ranges.ranges.windows(2).all(|pair| pair[0].1 + 1 < pair[1].0);
                 prop_assert!(neighbours);

@@ -57,10 +57,7 @@ impl Told {
         let highest_sequence = if more.is_empty() { end } else { feedback.more_highest };
         let pairs = missing.chunks_exact(2);
         let is_ascending = pairs.clone().all(|pair| pair[1] > 0)
-            && pairs
-                .clone()
-                .zip(pairs.skip(1))
-                .all(|(a, b)| a[0].saturating_add(a[1]) <= b[0]);
+            && pairs.clone().zip(pairs.skip(1)).all(|(a, b)| a[0].saturating_add(a[1]) <= b[0]);
         (is_ascending && end <= highest_sequence).then_some(Self {
             missing,
             highest_sequence,
@@ -78,7 +75,9 @@ impl Engine {
         };
         if datagram.header.link_sequence == 0 {
             datagram.for_each(|_, bytes| match LinkControl::decode(bytes) {
-                Ok(LinkControl { body: Some(body), .. }) => self.control_received(now, &datagram.header, body),
+                Ok(LinkControl { body: Some(body), .. }) => {
+                    self.control_received(now, &datagram.header, body)
+                }
                 // A newer flow may say more than this one knows.
                 Ok(LinkControl { body: None, .. }) => {}
                 Err(_) => self.counters.decode_errors += 1,
@@ -92,7 +91,8 @@ impl Engine {
         let header = &datagram.header;
         let Some(at) = self.known_sender(header) else { return };
         let class = header.class as usize;
-        let admission = self.with_inbox(now, at, |peer, inbox| peer[class].admit(inbox, header, datagram.len()));
+        let admission = self
+            .with_inbox(now, at, |peer, inbox| peer[class].admit(inbox, header, datagram.len()));
         match admission {
             Some(Admission::New) => {}
             Some(Admission::Repeated) if header.records > 0 => {
@@ -158,7 +158,8 @@ impl Engine {
         Some(act(&mut peer.receive, &mut inbox))
     }
 
-    /// Frees memory for `needs` bytes at the cost of the peer that takes most. Returns whether there is room.
+    /// Frees memory for `needs` bytes at the cost of the peer that takes most. Returns whether
+    /// there is room.
     fn make_room(&mut self, now: Instant, at: usize, needs: usize) -> bool {
         let limit = self.config.limits.reassembly_bytes;
         loop {
@@ -194,13 +195,15 @@ impl Engine {
         match body {
             Body::Feedback(feedback) => self.feedback_received(now, at, &feedback),
             Body::WrittenRequest(WrittenRequest { topic, token }) if peer.is_connected() => {
-                self.ledger
-                    .events
-                    .push_back(LinkEvent::WrittenAsked { from, topic, token });
+                self.ledger.events.push_back(LinkEvent::WrittenAsked { from, topic, token });
             }
-            Body::Written(Written { token }) => self.ledger.events.push_back(LinkEvent::Written { from, token }),
+            Body::Written(Written { token }) => {
+                self.ledger.events.push_back(LinkEvent::Written { from, token })
+            }
             Body::WrittenRequest(_) => {}
-            Body::Goodbye(goodbye) if goodbye.epoch == peer.endpoint.epoch => self.goodbye_received(now, at),
+            Body::Goodbye(goodbye) if goodbye.epoch == peer.endpoint.epoch => {
+                self.goodbye_received(now, at)
+            }
             Body::Goodbye(_) => self.counters.stale += 1,
             Body::Delta(_) | Body::SnapshotRequest(_) | Body::Snapshot(_) => {
                 if peer.is_connected() {
@@ -217,15 +220,13 @@ impl Engine {
             return;
         };
         let flow = FlowId::new(layer, node);
-        let speaks = hello.protocol_min <= u32::from(VERSION) && u32::from(VERSION) <= hello.protocol_max;
+        let speaks =
+            hello.protocol_min <= u32::from(VERSION) && u32::from(VERSION) <= hello.protocol_max;
         if !speaks || SenderId::of(&flow, hello.epoch) != header.sender {
             self.counters.decode_errors += 1;
             return;
         }
-        let endpoint = Endpoint {
-            flow: flow.clone(),
-            epoch: hello.epoch,
-        };
+        let endpoint = Endpoint { flow: flow.clone(), epoch: hello.epoch };
         let Some(at) = self.place_of(now, endpoint) else { return };
         let wall_ns = self.clocks.wall_ns(now);
         let now_ns = self.clocks.monotonic_ns(now);
@@ -237,10 +238,7 @@ impl Engine {
         peer.last_hello = Some(now);
         if let Some(clock) = &hello.clock {
             // An older Hello that was overtaken is of no use for the clocks.
-            if peer
-                .echo
-                .is_none_or(|echo| echo.sent_monotonic_ns < clock.sent_monotonic_ns)
-            {
+            if peer.echo.is_none_or(|echo| echo.sent_monotonic_ns < clock.sent_monotonic_ns) {
                 peer.echo = Some(Echo {
                     sent_monotonic_ns: clock.sent_monotonic_ns,
                     sent_wall_ns: clock.sent_wall_ns,
@@ -277,7 +275,8 @@ impl Engine {
     fn feedback_received(&mut self, now: Instant, at: usize, feedback: &Feedback) {
         let now_ns = self.clocks.monotonic_ns(now);
         let Some(peer) = self.peers[at].as_mut() else { return };
-        let (Some(class), Some(told)) = (class_of(feedback.link_class), Told::read(feedback)) else {
+        let (Some(class), Some(told)) = (class_of(feedback.link_class), Told::read(feedback))
+        else {
             self.counters.decode_errors += 1;
             return;
         };
@@ -308,19 +307,12 @@ impl Engine {
             return;
         }
         let (delivered_bytes, lost_bytes) = sender.take_settled();
-        let round_trip = peer
-            .round_trip
-            .echo(now, now_ns, feedback.echo_send_ns, feedback.echo_held_ns);
-        let seen = Seen {
-            delivered_bytes,
-            lost_bytes,
-            round_trip,
-        };
+        let round_trip =
+            peer.round_trip.echo(now, now_ns, feedback.echo_send_ns, feedback.echo_held_ns);
+        let seen = Seen { delivered_bytes, lost_bytes, round_trip };
         peer.path.feedback(now, &seen);
-        let silent = peer
-            .last_feedback
-            .replace(now)
-            .map(|last| now.saturating_duration_since(last));
+        let silent =
+            peer.last_feedback.replace(now).map(|last| now.saturating_duration_since(last));
         if peer.phase == Phase::Suspect {
             peer.phase = Phase::Up;
             // After a moment the way is the same one; a slow start would cost more than it spares.
@@ -332,7 +324,8 @@ impl Engine {
         }
     }
 
-    /// The peer stops: it is down at once and not waited for; late datagrams of that life are ignored.
+    /// The peer stops: it is down at once and not waited for; late datagrams of that life are
+    /// ignored.
     fn goodbye_received(&mut self, now: Instant, at: usize) {
         self.take_down(now, at, DownReason::Goodbye);
         let Some(peer) = &mut self.peers[at] else { return };
@@ -348,11 +341,7 @@ mod tests {
     use super::*;
 
     fn feedback(missing: &[u64], highest_sequence: u64) -> Feedback {
-        Feedback {
-            highest_sequence,
-            missing: missing.to_vec(),
-            ..Feedback::default()
-        }
+        Feedback { highest_sequence, missing: missing.to_vec(), ..Feedback::default() }
     }
 
     #[test]
@@ -365,10 +354,7 @@ mod tests {
             ..feedback(&[3, 2, 9, 1], 9)
         };
         let long = Told::read(&long).unwrap();
-        assert_eq!(
-            (long.missing, long.highest_sequence),
-            (vec![3, 2, 9, 1, 15, 1, 17, 10], 40)
-        );
+        assert_eq!((long.missing, long.highest_sequence), (vec![3, 2, 9, 1, 15, 1, 17, 10], 40));
     }
 
     #[test]
@@ -393,10 +379,7 @@ mod tests {
     #[test]
     fn messages_that_were_given_up_are_told_by_distances() {
         let given_up = |distances: &[u32]| {
-            let told = Told::read(&Feedback {
-                given_up: distances.to_vec(),
-                ..feedback(&[], 20)
-            });
+            let told = Told::read(&Feedback { given_up: distances.to_vec(), ..feedback(&[], 20) });
             told.map(|told| told.given_up)
         };
         assert_eq!(given_up(&[]), Some(vec![]));

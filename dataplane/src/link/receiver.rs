@@ -6,8 +6,9 @@
 //!             └→ Feedback: highest sequence, what is missing
 //! ```
 //!
-//! Each message is settled once: delivered, dropped or given up. A settled one is never looked at again. What is dropped is counted
-//! here; of what is given up before anything of it came the sender is told, which counts it: here it has no name.
+//! Each message is settled once: delivered, dropped or given up. A settled one is never looked at
+//! again. What is dropped is counted here; of what is given up before anything of it came the
+//! sender is told, which counts it: here it has no name.
 
 mod settle;
 mod timing;
@@ -28,9 +29,10 @@ use super::ranges::RangeSet;
 use super::wire::{LinkHeader, Record};
 use crate::lane::measure::micros;
 
-/// An unfinished message is given up that long after its last part, and so is the one that another waits for. Time in
-/// which nothing of the class comes does not count: the sender may have been cut off, or have more urgent things to send.
-/// Nor does time in which more is missing than a Feedback can tell: nobody repairs what it was not asked for.
+/// An unfinished message is given up that long after its last part, and so is the one that another
+/// waits for. Time in which nothing of the class comes does not count: the sender may have been cut
+/// off, or have more urgent things to send. Nor does time in which more is missing than a Feedback
+/// can tell: nobody repairs what it was not asked for.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// … but that long at most.
 const LONGEST_PATIENCE: Duration = Duration::from_secs(30);
@@ -43,8 +45,8 @@ const FEEDBACK_IDLE: Duration = Duration::from_millis(500);
 const FEEDBACK_SAMPLES: u32 = 64;
 /// Missing ranges in one Feedback, by their sequences. Flows of the first version take no more.
 pub(crate) const MISSING_RANGES: usize = 32;
-/// Missing ranges that a Feedback tells beyond those, by their distances, as far as its datagram has room. All that is lost in
-/// a round trip should fit: what does not waits for the next one.
+/// Missing ranges that a Feedback tells beyond those, by their distances, as far as its datagram
+/// has room. All that is lost in a round trip should fit: what does not waits for the next one.
 pub(crate) const MORE_RANGES: usize = 512;
 /// Messages in one Feedback that were given up although nothing of them came.
 pub(crate) const GIVEN_UP_TOLD: usize = 64;
@@ -196,7 +198,12 @@ impl ReceiveClass {
     }
 
     /// Takes note of a sample. Its records count only if it is [`Admission::New`].
-    pub(crate) fn admit(&mut self, inbox: &mut Inbox<'_>, header: &LinkHeader, bytes: usize) -> Admission {
+    pub(crate) fn admit(
+        &mut self,
+        inbox: &mut Inbox<'_>,
+        header: &LinkHeader,
+        bytes: usize,
+    ) -> Admission {
         if header.link_epoch < self.link_epoch {
             return Admission::Stale;
         }
@@ -216,8 +223,8 @@ impl ReceiveClass {
         if header.records == 0 {
             self.feedback_due = true;
         }
-        // Floors only rise, so those of a sample that came before are as good, and so are those of one that is refused: where too
-        // much is missing, they alone make room again.
+        // Floors only rise, so those of a sample that came before are as good, and so are those of
+        // one that is refused: where too much is missing, they alone make room again.
         self.give_up_below(inbox, u64::from(header.message_floor));
         if self.given_up.first().is_some_and(|first| *first < header.message_floor) {
             self.given_up = self.given_up.split_off(&header.message_floor);
@@ -243,7 +250,8 @@ impl ReceiveClass {
         if self.samples >= FEEDBACK_SAMPLES {
             self.feedback_due = true;
         } else if self.feedback_at.is_none() {
-            self.feedback_at = Some(self.last_feedback.map_or(now, |last| (last + FEEDBACK_EVERY).max(now)));
+            self.feedback_at =
+                Some(self.last_feedback.map_or(now, |last| (last + FEEDBACK_EVERY).max(now)));
         }
         Admission::New
     }
@@ -255,7 +263,8 @@ impl ReceiveClass {
     /// Memory that a record would newly hold, at most.
     pub(crate) fn needs(&self, record: &Record, datagram_bytes: usize) -> usize {
         if record.is_whole() {
-            let waits = record.behind != 0 && !self.is_settled(record.message - u32::from(record.behind));
+            let waits =
+                record.behind != 0 && !self.is_settled(record.message - u32::from(record.behind));
             return if waits { datagram_bytes + MESSAGE_OVERHEAD } else { 0 };
         }
         if self.assemblies.contains_key(&record.message) || self.is_settled(record.message) {
@@ -265,7 +274,13 @@ impl ReceiveClass {
     }
 
     /// Takes a record of a new sample.
-    pub(crate) fn record(&mut self, inbox: &mut Inbox<'_>, record: &Record, bytes: Bytes, datagram_bytes: usize) {
+    pub(crate) fn record(
+        &mut self,
+        inbox: &mut Inbox<'_>,
+        record: &Record,
+        bytes: Bytes,
+        datagram_bytes: usize,
+    ) {
         let number = record.message;
         if self.is_settled(number) || self.held.contains_key(&number) {
             inbox.counters.duplicates += 1;
@@ -311,13 +326,8 @@ impl ReceiveClass {
         let (behind, hops, age_us) = (assembly.behind, assembly.hops, assembly.age_us);
         let (first_part, lag) = (assembly.first_part, assembly.half_round_trip);
         let memory = Assembly::memory(assembly.total());
-        let message = assembly.into_frame().map(|frame| Complete {
-            frame,
-            hops,
-            age_us,
-            first_part,
-            lag,
-        });
+        let message =
+            assembly.into_frame().map(|frame| Complete { frame, hops, age_us, first_part, lag });
         self.complete(inbox, number, behind, message, memory);
     }
 
@@ -328,7 +338,14 @@ impl ReceiveClass {
     }
 
     /// A message is complete: deliver it, or keep it until the one before it is settled.
-    fn complete(&mut self, inbox: &mut Inbox<'_>, number: u32, behind: u16, message: Option<Complete>, memory: usize) {
+    fn complete(
+        &mut self,
+        inbox: &mut Inbox<'_>,
+        number: u32,
+        behind: u16,
+        message: Option<Complete>,
+        memory: usize,
+    ) {
         let Some(message) = message else {
             inbox.counters.decode_errors += 1;
             inbox.dropped("", DropReason::DecodeError);
@@ -344,13 +361,7 @@ impl ReceiveClass {
         self.reserved += memory;
         self.waiters.entry(before).or_default().push(number);
         self.sweep_at.get_or_insert(inbox.now + SWEEP);
-        let held = Held {
-            message,
-            before,
-            since: inbox.now,
-            active: self.active,
-            bytes: memory,
-        };
+        let held = Held { message, before, since: inbox.now, active: self.active, bytes: memory };
         if let Some(at) = held.hand_out_at() {
             self.hand_out_at = Some(self.hand_out_at.map_or(at, |next| next.min(at)));
         }
@@ -364,13 +375,7 @@ impl ReceiveClass {
 
     /// Hands a message out, unless it is too old or a newer one of its stream was first.
     fn deliver(&mut self, inbox: &mut Inbox<'_>, number: u32, message: Complete) {
-        let Complete {
-            frame,
-            hops,
-            age_us,
-            first_part,
-            lag,
-        } = message;
+        let Complete { frame, hops, age_us, first_part, lag } = message;
         let here = inbox.now.saturating_duration_since(first_part) + lag;
         let age_us = u64::from(age_us).saturating_add(micros(here));
         if frame.lifespan_ms() != 0 && age_us > u64::from(frame.lifespan_ms()) * 1000 {
@@ -407,7 +412,8 @@ impl Held {
             return None;
         }
         let age = Duration::from_micros(u64::from(self.message.age_us)) + self.message.lag;
-        let left = Duration::from_millis(u64::from(lifespan)).saturating_sub(age + LIFESPAN_RESERVE);
+        let left =
+            Duration::from_millis(u64::from(lifespan)).saturating_sub(age + LIFESPAN_RESERVE);
         self.message.first_part.checked_add(left)
     }
 }

@@ -6,8 +6,9 @@
 //!                                                        └── repairs ◄────┘
 //! ```
 //!
-//! A message gets its number when its first byte leaves, so what gives way before leaves no gap. Best-effort messages of
-//! one part are out when they are sent; the others are kept until each part is acknowledged.
+//! A message gets its number when its first byte leaves, so what gives way before leaves no gap.
+//! Best-effort messages of one part are out when they are sent; the others are kept until each part
+//! is acknowledged.
 
 mod acknowledge;
 mod timing;
@@ -110,7 +111,8 @@ pub(crate) struct SendClass {
     last_sweep: Option<Instant>,
     pub loss: LossMeter,
     pub rate: RateMeter,
-    /// Wire bytes of samples that were found to be received and lost, since the last [`SendClass::take_settled`].
+    /// Wire bytes of samples that were found to be received and lost, since the last
+    /// [`SendClass::take_settled`].
     settled: [u64; 2],
 }
 
@@ -226,7 +228,8 @@ impl SendClass {
         }
         let message = Outgoing::new(submit, self.part_bytes());
         let cost = Self::cost(&message);
-        // What waits for its acknowledgement has a bound of its own: a late Feedback must not cost a message.
+        // What waits for its acknowledgement has a bound of its own: a late Feedback must not cost
+        // a message.
         while self.waiting_bytes > 0 && self.waiting_bytes + cost > self.limits.queue_bytes {
             let Some(oldest) = self.waiting.pop_front() else { break };
             self.drop_message(oldest, DropReason::QueueFull, ledger);
@@ -240,21 +243,20 @@ impl SendClass {
         self.waiting.push_back(key);
     }
 
-    /// Lets the oldest unstarted messages of a stream go, until there is place for one more among the newest `keep`.
+    /// Lets the oldest unstarted messages of a stream go, until there is place for one more among
+    /// the newest `keep`.
     fn make_place(&mut self, lane: LaneId, stream: StreamKey, keep: usize, ledger: &mut Ledger) {
         let messages = &self.messages;
-        let same = |key: &&Key| {
-            messages
-                .get(**key)
-                .is_some_and(|m| m.lane == lane && m.stream == stream)
-        };
+        let same =
+            |key: &&Key| messages.get(**key).is_some_and(|m| m.lane == lane && m.stream == stream);
         let waiting: SmallVec<[Key; 4]> = self.waiting.iter().filter(same).copied().collect();
         for oldest in waiting.iter().take((waiting.len() + 1).saturating_sub(keep)) {
             self.drop_message(*oldest, DropReason::QueueFull, ledger);
         }
     }
 
-    /// Takes a message away and counts it. A started one leaves its place in the order to the one before it.
+    /// Takes a message away and counts it. A started one leaves its place in the order to the one
+    /// before it.
     fn drop_message(&mut self, key: Key, reason: DropReason, ledger: &mut Ledger) {
         if let Some(message) = self.take(key) {
             count_dropped(&message, reason, ledger);
@@ -322,7 +324,8 @@ impl SendClass {
         self.waiting.retain(|key| messages.get(*key).is_some());
     }
 
-    /// Lowest message that may still be sent, and how many samples are unsettled once one more is sent.
+    /// Lowest message that may still be sent, and how many samples are unsettled once one more is
+    /// sent.
     fn floors(&mut self, next_number: u32) -> (u32, u32) {
         while let Some((_, key)) = self.started.front()
             && self.messages.get(*key).is_none()
@@ -349,8 +352,8 @@ impl SendClass {
         }
     }
 
-    /// The next datagram with messages, if there is anything to send and credit for it. Returns it with the bytes of
-    /// messages in it.
+    /// The next datagram with messages, if there is anything to send and credit for it. Returns it
+    /// with the bytes of messages in it.
     pub(crate) fn transmit(&mut self, ctx: &mut SendContext<'_>) -> Option<bytes::Bytes> {
         if !self.has_work() {
             return None;
@@ -474,7 +477,8 @@ impl SendClass {
                 continue;
             }
             self.current = None;
-            let (lane, bytes, wait) = (message.lane, message.payload_bytes(), message.waited(ctx.now));
+            let (lane, bytes, wait) =
+                (message.lane, message.payload_bytes(), message.waited(ctx.now));
             let is_out = !message.ordered;
             ctx.ledger.sent(lane, bytes, wait);
             if is_out {
@@ -498,7 +502,8 @@ impl SendClass {
                 continue;
             }
             let cost = Self::cost(message);
-            let room = self.started_bytes == 0 || self.started_bytes + cost <= self.limits.queue_bytes;
+            let room =
+                self.started_bytes == 0 || self.started_bytes + cost <= self.limits.queue_bytes;
             return ((room || !message.ordered) && self.next_number < LAST_NUMBER).then_some(key);
         }
     }

@@ -1,5 +1,5 @@
-//! A simulated network for tests: seeded, with its own time. [`Network`] carries datagrams for anybody; [`Sim`] drives
-//! engines over it and keeps account of their messages.
+//! A simulated network for tests: seeded, with its own time. [`Network`] carries datagrams for
+//! anybody; [`Sim`] drives engines over it and keeps account of their messages.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::time::{Duration, Instant};
@@ -29,10 +29,7 @@ pub(crate) struct Weather {
 
 impl Weather {
     pub(crate) fn delay(milliseconds: u64) -> Self {
-        Self {
-            delay: Duration::from_millis(milliseconds),
-            ..Self::default()
-        }
+        Self { delay: Duration::from_millis(milliseconds), ..Self::default() }
     }
 }
 
@@ -90,7 +87,14 @@ impl Network {
         self.set_cut(b, a, cut);
     }
 
-    pub(crate) fn send(&mut self, now: Instant, from: &Endpoint, to: &Endpoint, class: Priority, datagram: &Bytes) {
+    pub(crate) fn send(
+        &mut self,
+        now: Instant,
+        from: &Endpoint,
+        to: &Endpoint,
+        class: Priority,
+        datagram: &Bytes,
+    ) {
         let path = (from.flow.clone(), to.flow.clone());
         let weather = self.paths.get(&path).copied().unwrap_or(self.weather);
         let censored = self.censor.as_mut().is_some_and(|lose| lose(from, to, class, datagram));
@@ -100,11 +104,7 @@ impl Network {
         let copies = 1 + u32::from(self.random.chance(weather.duplicated));
         for _ in 0..copies {
             let due = now + weather.delay + self.random.duration(weather.jitter);
-            let arrival = Arrival {
-                to: to.clone(),
-                class,
-                datagram: datagram.clone(),
-            };
+            let arrival = Arrival { to: to.clone(), class, datagram: datagram.clone() };
             self.flights.send(due, arrival);
         }
     }
@@ -201,10 +201,7 @@ impl Post {
     }
 
     pub(crate) fn reliable(stream: u32) -> Self {
-        Self {
-            reliable: true,
-            ..Self::small(stream)
-        }
+        Self { reliable: true, ..Self::small(stream) }
     }
 
     pub(crate) fn large(stream: u32, bytes: usize) -> Self {
@@ -336,10 +333,7 @@ impl Sim {
     /// Replaces a flow by a new life of it, as after a crash: a new engine with the next epoch.
     pub(crate) fn crash(&mut self, at: usize) {
         let old = self.endpoint(at);
-        let config = EngineConfig {
-            epoch: old.epoch + 1,
-            ..self.nodes[at].engine.config.clone()
-        };
+        let config = EngineConfig { epoch: old.epoch + 1, ..self.nodes[at].engine.config.clone() };
         let node = &mut self.nodes[at];
         // What a dead process had waiting is counted by nobody.
         node.lanes.clear();
@@ -356,7 +350,12 @@ impl Sim {
     }
 
     /// Submits the next message of a stream. Returns its sequence, or why it was not taken.
-    pub(crate) fn publish(&mut self, from: usize, to: usize, post: Post) -> Result<u64, DropReason> {
+    pub(crate) fn publish(
+        &mut self,
+        from: usize,
+        to: usize,
+        post: Post,
+    ) -> Result<u64, DropReason> {
         let sequence = self.sequences.entry((from, post.stream)).or_insert(0);
         *sequence += 1;
         let sequence = *sequence;
@@ -366,10 +365,7 @@ impl Sim {
             to: &to,
             class: post.class,
             lane,
-            stream: StreamKey {
-                topic: post.stream,
-                writer: writer(post.stream),
-            },
+            stream: StreamKey { topic: post.stream, writer: writer(post.stream) },
             frame: frame(post, sequence),
             arrived: self.now,
             reliable: post.reliable,
@@ -388,7 +384,9 @@ impl Sim {
         let node = &mut self.nodes[at];
         while let Some(event) = node.engine.poll_event() {
             match event {
-                LinkEvent::Deliver { from, frame, at } => node.delivered.push(Delivered { from, epoch, at, frame }),
+                LinkEvent::Deliver { from, frame, at } => {
+                    node.delivered.push(Delivered { from, epoch, at, frame })
+                }
                 LinkEvent::LaneSent { lane, .. } => node.lanes.entry(lane).or_default().sent += 1,
                 LinkEvent::LaneOut { lane, .. } => node.lanes.entry(lane).or_default().out += 1,
                 LinkEvent::LaneDropped { lane, reason } => {
@@ -445,13 +443,15 @@ impl Sim {
             let Some(next) = self.next_step().filter(|next| *next <= end) else {
                 break;
             };
-            // A timeout that does nothing would spin here; time moves on, so that the test fails instead.
+            // A timeout that does nothing would spin here; time moves on, so that the test fails
+            // instead.
             self.now = next.max(self.now + Duration::from_nanos(1));
             if self.now > end {
                 break;
             }
             while let Some(arrival) = self.network.arrival(self.now) {
-                let to = (0..self.nodes.len()).find(|at| self.endpoint(*at) == arrival.to && self.nodes[*at].alive);
+                let to = (0..self.nodes.len())
+                    .find(|at| self.endpoint(*at) == arrival.to && self.nodes[*at].alive);
                 if let Some(to) = to {
                     self.nodes[to].engine.receive(self.now, arrival.datagram, arrival.class);
                     self.take_events(to);
@@ -477,7 +477,12 @@ impl Sim {
     }
 
     /// Runs until a condition holds. Panics after `limit`.
-    pub(crate) fn run_to(&mut self, limit: Duration, what: &str, mut done: impl FnMut(&Self) -> bool) {
+    pub(crate) fn run_to(
+        &mut self,
+        limit: Duration,
+        what: &str,
+        mut done: impl FnMut(&Self) -> bool,
+    ) {
         let end = self.now + limit;
         while !done(self) {
             assert!(self.now < end, "not within {limit:?}: {what}");
@@ -509,7 +514,8 @@ impl Sim {
         }
     }
 
-    /// What was delivered is whole, in order per stream, once in each life of the receiver, and never in two of them.
+    /// What was delivered is whole, in order per stream, once in each life of the receiver, and
+    /// never in two of them.
     pub(crate) fn check_deliveries(&self) {
         for (at, node) in self.nodes.iter().enumerate() {
             let mut newest: HashMap<(u64, WriterId, FlowId), u64> = HashMap::new();
@@ -519,10 +525,7 @@ impl Sim {
                 let stream = u32::from_le_bytes(writer.0[..4].try_into().unwrap());
                 let key = (delivered.epoch, writer, delivered.from.clone());
                 let before = newest.insert(key, sequence).unwrap_or(0);
-                assert!(
-                    before < sequence,
-                    "flow {at}, stream {stream}: {sequence} after {before}"
-                );
+                assert!(before < sequence, "flow {at}, stream {stream}: {sequence} after {before}");
                 assert!(
                     seen.insert((delivered.from.clone(), writer, sequence)),
                     "flow {at}, stream {stream}: {sequence} in two lives"

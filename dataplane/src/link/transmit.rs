@@ -21,12 +21,15 @@ const LARGEST_FEEDBACK: usize = 760;
 const LARGEST_CONTROL: usize = 1_200;
 
 impl Engine {
-    /// The next datagram that carries no message, LinkControl or a probe, for the next peer that has any.
+    /// The next datagram that carries no message, LinkControl or a probe, for the next peer that
+    /// has any.
     pub fn poll_control(&mut self, now: Instant) -> Option<Transmit> {
         let count = self.peers.len();
         for step in 1..=count {
             let at = (self.cursors[3] + step) % count;
-            if let Some(transmit) = self.control_datagram(now, at).or_else(|| self.probe_datagram(now, at)) {
+            if let Some(transmit) =
+                self.control_datagram(now, at).or_else(|| self.probe_datagram(now, at))
+            {
                 self.cursors[3] = at;
                 return Some(transmit);
             }
@@ -37,7 +40,9 @@ impl Engine {
     fn control_datagram(&mut self, now: Instant, at: usize) -> Option<Transmit> {
         let peer = self.peers[at].as_ref()?;
         let feedback = peer.is_connected() && peer.receive.iter().any(ReceiveClass::feedback_due);
-        if !(peer.hello_due || feedback || peer.goodbye_due || !peer.controls.is_empty()) || peer.phase == Phase::Gone {
+        if !(peer.hello_due || feedback || peer.goodbye_due || !peer.controls.is_empty())
+            || peer.phase == Phase::Gone
+        {
             return None;
         }
         let mut out = DatagramBuilder::new(self.config.max_datagram);
@@ -72,12 +77,7 @@ impl Engine {
             message_floor: 0,
         });
         self.budgets.spend(now, &to.flow.layer, &mut peer.path, datagram.len());
-        Some(Transmit {
-            to,
-            class: Priority::Control,
-            datagram,
-            control: true,
-        })
+        Some(Transmit { to, class: Priority::Control, datagram, control: true })
     }
 
     fn hello_for(&mut self, now: Instant, at: usize) -> Hello {
@@ -125,7 +125,8 @@ impl Engine {
         let share = self.receive_share(at);
         let Some(peer) = &mut self.peers[at] else { return };
         for (index, class) in peer.receive.iter_mut().enumerate() {
-            // One with all its ranges fits an empty datagram; those for which there is no room go with the next.
+            // One with all its ranges fits an empty datagram; those for which there is no room go
+            // with the next.
             if class.feedback_due() && out.fits(LARGEST_FEEDBACK) {
                 let room = out.room().min(LARGEST_CONTROL);
                 let feedback = class.feedback(now, class_code(Priority::ALL[index]), share, room);
@@ -155,8 +156,7 @@ impl Engine {
         };
         for (index, class) in peer.send.iter_mut().enumerate() {
             if let Some(datagram) = class.probe(&mut ctx) {
-                self.budgets
-                    .spend(now, &peer.endpoint.flow.layer, &mut peer.path, datagram.len());
+                self.budgets.spend(now, &peer.endpoint.flow.layer, &mut peer.path, datagram.len());
                 return Some(Transmit {
                     to: peer.endpoint.clone(),
                     class: Priority::ALL[index],
@@ -176,11 +176,14 @@ impl Engine {
         for (index, class) in Priority::ALL.iter().copied().enumerate() {
             for step in 1..=count {
                 let at = (self.cursors[index] + step) % count;
-                let Some(peer) = self.peers[at].as_mut().filter(|peer| peer.phase == Phase::Up) else {
+                let Some(peer) = self.peers[at].as_mut().filter(|peer| peer.phase == Phase::Up)
+                else {
                     continue;
                 };
                 let layer = &peer.endpoint.flow.layer;
-                if !peer.send[index].has_work() || !self.budgets.may_send(now, layer, &mut peer.path) {
+                if !peer.send[index].has_work()
+                    || !self.budgets.may_send(now, layer, &mut peer.path)
+                {
                     continue;
                 }
                 let mut ctx = SendContext {

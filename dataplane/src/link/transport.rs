@@ -1,15 +1,16 @@
 //! How datagrams get from flow to flow. DDS today; QUIC is to be a second one.
 //!
-//! A transport finds other flows, carries single datagrams to them and tells what came. It knows nothing of messages,
-//! acknowledgements or rates: those are the engine's. It never blocks a sender.
+//! A transport finds other flows, carries single datagrams to them and tells what came. It knows
+//! nothing of messages, acknowledgements or rates: those are the engine's. It never blocks a
+//! sender.
 
 use std::fmt;
 
 use blaze_domain::{FlowId, Priority};
 use bytes::Bytes;
 
-/// One life of one flow on the inter scope. Names of link topics hold all three parts, so that a dead life's readers
-/// never hold back writers to the new one.
+/// One life of one flow on the inter scope. Names of link topics hold all three parts, so that a
+/// dead life's readers never hold back writers to the new one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Endpoint {
     /// The flow.
@@ -50,6 +51,7 @@ pub enum TransportEvent {
 pub enum SendOutcome {
     /// Handed to the network.
     Sent,
-    /// No writer to that endpoint, or it could not take it now; the engine's repair treats it as lost.
+    /// No writer to that endpoint, or it could not take it now; the engine's repair treats it as
+    /// lost.
     NotSent,
 }

@@ -7,10 +7,10 @@
 //! record   = u32 message | u32 total | u32 offset | u32 length | u8 hops | u8 flags | u16 behind | u32 age_us, then bytes
 //! ```
 //!
-//! `link_sequence` 0 marks a datagram of LinkControl records; it counts nowhere. A datagram without records is a probe.
-//! Two floors let a receiver forget exactly what its sender no longer cares for: samples up to
-//! `link_sequence - unsettled` are known to be received or lost, and messages below `message_floor` are delivered or
-//! given up and will never be sent again.
+//! `link_sequence` 0 marks a datagram of LinkControl records; it counts nowhere. A datagram without
+//! records is a probe. Two floors let a receiver forget exactly what its sender no longer cares
+//! for: samples up to `link_sequence - unsettled` are known to be received or lost, and messages
+//! below `message_floor` are delivered or given up and will never be sent again.
 
 use blaze_domain::{FlowId, LayerKind, Priority};
 use blaze_proto::frame::MAX_FRAME_BYTES;
@@ -25,7 +25,8 @@ pub(crate) const VERSION: u8 = 1;
 pub const HEADER_BYTES: usize = 40;
 /// Bytes before the content of each record.
 pub const RECORD_BYTES: usize = 24;
-/// Smallest part of a message, except for its last one: bounds what a receiver has to note of an unfinished message.
+/// Smallest part of a message, except for its last one: bounds what a receiver has to note of an
+/// unfinished message.
 pub(crate) const MIN_PART_BYTES: usize = 256;
 
 /// The record is an encoded `LinkControl`.
@@ -33,7 +34,8 @@ pub(crate) const FLAG_CONTROL: u8 = 1;
 /// The part was sent before.
 pub(crate) const FLAG_REPAIR: u8 = 2;
 
-/// One life of one flow, in eight bytes: a hash of layer, node and epoch. A Hello binds it to the names.
+/// One life of one flow, in eight bytes: a hash of layer, node and epoch. A Hello binds it to the
+/// names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct SenderId(pub u64);
 
@@ -76,7 +78,8 @@ pub(crate) struct LinkHeader {
     pub link_sequence: u64,
     /// The sender's monotonic clock.
     pub send_ns: u64,
-    /// How many of the newest samples, this one included, the sender does not yet know to be received or lost.
+    /// How many of the newest samples, this one included, the sender does not yet know to be
+    /// received or lost.
     pub unsettled: u32,
     /// Lowest message that may still be sent.
     pub message_floor: u32,
@@ -104,7 +107,8 @@ impl Record {
         if self.flags & FLAG_CONTROL != 0 {
             return true;
         }
-        let (offset, length, total) = (self.offset as usize, self.length as usize, self.total as usize);
+        let (offset, length, total) =
+            (self.offset as usize, self.length as usize, self.total as usize);
         let Some(end) = offset.checked_add(length) else {
             return false;
         };
@@ -190,7 +194,8 @@ impl Datagram {
     pub(crate) fn for_each(&self, mut each: impl FnMut(&Record, Bytes)) {
         let mut at = HEADER_BYTES;
         for _ in 0..self.header.records {
-            let Some(record) = self.bytes.get(at..).and_then(|mut rest| Record::read(&mut rest)) else {
+            let Some(record) = self.bytes.get(at..).and_then(|mut rest| Record::read(&mut rest))
+            else {
                 return;
             };
             let start = at + RECORD_BYTES;
@@ -212,11 +217,7 @@ impl DatagramBuilder {
     pub(crate) fn new(limit: usize) -> Self {
         let mut bytes = BytesMut::with_capacity(limit);
         bytes.put_bytes(0, HEADER_BYTES);
-        Self {
-            bytes,
-            records: 0,
-            limit,
-        }
+        Self { bytes, records: 0, limit }
     }
 
     pub(crate) fn is_empty(&self) -> bool {
@@ -342,11 +343,8 @@ mod tests {
 
     fn frame(payload: usize) -> Frame {
         let bytes: Vec<u8> = (0..payload).map(|at| u8::try_from(at % 251).unwrap()).collect();
-        Frame::new(
-            &Header::new("a/b", Origin::default(), WriterId([7; 16]), 1, 1),
-            bytes.into(),
-        )
-        .unwrap()
+        Frame::new(&Header::new("a/b", Origin::default(), WriterId([7; 16]), 1, 1), bytes.into())
+            .unwrap()
     }
 
     fn part(frame: &Frame, offset: usize, length: usize) -> Record {
@@ -366,19 +364,15 @@ mod tests {
     fn parts_of_a_frame_come_back_as_they_were() {
         let frame = frame(2_000);
         let whole = [&frame.head()[..], &frame.payload()[..]].concat();
-        for (offset, length) in [(0, 300), (0, whole.len()), (20, 500), (1_000, whole.len() - 1_000)] {
+        for (offset, length) in
+            [(0, 300), (0, whole.len()), (20, 500), (1_000, whole.len() - 1_000)]
+        {
             let record = part(&frame, offset, length);
             let mut builder = DatagramBuilder::new(4_000);
             builder.put_part(&record, &frame);
             builder.put_part(&record, &frame);
             let datagram = Datagram::parse(builder.finish(&header(8)), Priority::State).unwrap();
-            assert_eq!(
-                datagram.header,
-                LinkHeader {
-                    records: 2,
-                    ..header(8)
-                }
-            );
+            assert_eq!(datagram.header, LinkHeader { records: 2, ..header(8) });
             let mut seen = 0;
             datagram.for_each(|found, bytes| {
                 assert_eq!(*found, record);
@@ -403,15 +397,9 @@ mod tests {
             Some(WireError::Record(0)),
             "a tiny part"
         );
-        let huge = Record {
-            total: u32::MAX,
-            ..part(&frame, 0, 300)
-        };
+        let huge = Record { total: u32::MAX, ..part(&frame, 0, 300) };
         assert_eq!(parse(huge, header(8)), Some(WireError::Record(0)));
-        let before_the_first = Record {
-            behind: 5,
-            ..part(&frame, 0, 300)
-        };
+        let before_the_first = Record { behind: 5, ..part(&frame, 0, 300) };
         assert_eq!(parse(before_the_first, header(8)), Some(WireError::Record(0)));
         assert_eq!(
             parse(part(&frame, 0, 300), header(1)),
@@ -420,10 +408,7 @@ mod tests {
         );
         assert_eq!(parse(part(&frame, 0, 300), header(0)), Some(WireError::Header));
         let probe = DatagramBuilder::new(100).finish(&header(8));
-        assert_eq!(
-            Datagram::parse(probe.clone(), Priority::Bulk).err(),
-            Some(WireError::Class(2))
-        );
+        assert_eq!(Datagram::parse(probe.clone(), Priority::Bulk).err(), Some(WireError::Class(2)));
         assert_eq!(
             Datagram::parse(probe.slice(..39), Priority::State).err(),
             Some(WireError::Short(39))
@@ -439,7 +424,8 @@ mod tests {
 
     proptest! {
         #[test]
-        fn random_datagrams_never_panic(mut bytes in proptest::collection::vec(any::<u8>(), 0..400), ours: bool) {
+        fn random_datagrams_never_panic(mut bytes in proptest::collection::vec(any::<u8>(), 0..400),
+            ours: bool) {
             if ours && bytes.len() > 4 {
                 let records = bytes[2] % 4;
                 bytes[..4].copy_from_slice(&[VERSION, 2, records, 0]);

@@ -6,8 +6,9 @@
 //!   b ═══ inter        `gateway: false` never              e … z ── layer scope ── a, b, c, d
 //! ```
 //!
-//! The choice is a pure function of what a flow hears on the channel of its layer broker. Flows that hear the same choose the
-//! same; where they do not, there are a few more gateways than needed, or the next look makes up for it.
+//! The choice is a pure function of what a flow hears on the channel of its layer broker. Flows
+//! that hear the same choose the same; where they do not, there are a few more gateways than
+//! needed, or the next look makes up for it.
 
 use blaze_domain::FlowId;
 use blaze_domain::node_file::AutoBool;
@@ -49,7 +50,8 @@ pub fn choose(world: &World) -> Choice {
     let group: Vec<(&FlowId, &FlowView)> = living(world).collect();
     let of = |setting: AutoBool| group.iter().filter(move |(_, view)| view.gateway == setting);
     let always = of(AutoBool::Yes).count();
-    let (now, others): (Vec<_>, Vec<_>) = of(AutoBool::Auto).partition(|(_, view)| view.role.is_gateway());
+    let (now, others): (Vec<_>, Vec<_>) =
+        of(AutoBool::Auto).partition(|(_, view)| view.role.is_gateway());
     let wanted = GATEWAYS.saturating_sub(always);
     let key = world.me.layer.as_str();
     let among = |flows: &[&(&FlowId, &FlowView)], places: usize| {
@@ -70,13 +72,17 @@ pub fn choose(world: &World) -> Choice {
 
 /// Flows of the own group, itself among them, that are on the inter scope for it and carry topics.
 pub fn gateways(world: &World) -> impl Iterator<Item = &FlowId> {
-    let carries = |(_, view): &(&FlowId, &FlowView)| view.role.is_gateway() && view.state == FlowState::Ready;
+    let carries =
+        |(_, view): &(&FlowId, &FlowView)| view.role.is_gateway() && view.state == FlowState::Ready;
     living(world).filter(carries).map(|(id, _)| id)
 }
 
-/// Flows of the own group, itself among them, that are not on the inter scope and carry topics within the layer.
+/// Flows of the own group, itself among them, that are not on the inter scope and carry topics
+/// within the layer.
 pub fn members(world: &World) -> impl Iterator<Item = &FlowId> {
-    let carries = |(_, view): &(&FlowId, &FlowView)| view.role == Role::Member && view.state == FlowState::Ready;
+    let carries = |(_, view): &(&FlowId, &FlowView)| {
+        view.role == Role::Member && view.state == FlowState::Ready
+    };
     living(world).filter(carries).map(|(id, _)| id)
 }
 
@@ -91,7 +97,8 @@ fn living(world: &World) -> impl Iterator<Item = (&FlowId, &FlowView)> {
     let group = own.map(|(id, view)| Group::of(id, view));
     world.flows.iter().filter(move |(id, view)| {
         Some(Group::of(id, view)) == group
-            && (**id == world.me || (view.reach != Reach::Down && view.state != FlowState::Draining))
+            && (**id == world.me
+                || (view.reach != Reach::Down && view.state != FlowState::Draining))
     })
 }
 
@@ -107,20 +114,13 @@ mod tests {
     /// A group of so many flows, all of which hear each other, none on the inter scope.
     fn group(count: usize) -> BTreeMap<FlowId, FlowView> {
         let name = |n: usize| format!("cloud/c-{n}").parse().unwrap();
-        let view = || FlowView {
-            role: Role::Member,
-            ..flow(Some(1))
-        };
+        let view = || FlowView { role: Role::Member, ..flow(Some(1)) };
         (0..count).map(|n| (name(n), view())).collect()
     }
 
     fn choices(flows: &BTreeMap<FlowId, FlowView>) -> BTreeMap<FlowId, Choice> {
         let choice = |me: &FlowId| {
-            choose(&World {
-                me: me.clone(),
-                flows: flows.clone(),
-                access: AccessRules::default(),
-            })
+            choose(&World { me: me.clone(), flows: flows.clone(), access: AccessRules::default() })
         };
         flows.keys().map(|me| (me.clone(), choice(me))).collect()
     }
@@ -189,12 +189,8 @@ mod tests {
         follow(&mut flows);
         assert_eq!((flows.len(), gateways_of(&flows).len()), (17, GATEWAYS));
         for extra in 0..4 {
-            let member = flows
-                .iter()
-                .find(|(_, view)| view.role == Role::Member)
-                .unwrap()
-                .0
-                .clone();
+            let member =
+                flows.iter().find(|(_, view)| view.role == Role::Member).unwrap().0.clone();
             flows.get_mut(&member).unwrap().role = Role::Gateway;
             assert_eq!(follow(&mut flows), 0, "{} gateways are no more than eight", extra + 5);
         }
@@ -207,10 +203,7 @@ mod tests {
             for view in flows.values_mut() {
                 view.gateway = AutoBool::No;
             }
-            assert!(
-                choices(&flows).values().all(|choice| *choice == Choice::No),
-                "nobody may"
-            );
+            assert!(choices(&flows).values().all(|choice| *choice == Choice::No), "nobody may");
             let first = flows.keys().next().unwrap().clone();
             flows.get_mut(&first).unwrap().gateway = AutoBool::Yes;
             follow(&mut flows);
@@ -221,22 +214,14 @@ mod tests {
             view.gateway = AutoBool::Yes;
         }
         follow(&mut flows);
-        assert_eq!(
-            gateways_of(&flows).len(),
-            6,
-            "with six that always are no other is needed"
-        );
+        assert_eq!(gateways_of(&flows).len(), 6, "with six that always are no other is needed");
     }
 
     #[test]
     fn a_flow_that_shares_no_broker_is_not_concerned() {
         let mut flows = group(1);
         let (id, view) = flows.pop_first().unwrap();
-        let view = FlowView {
-            layer_scope: None,
-            gateway: AutoBool::No,
-            ..view
-        };
+        let view = FlowView { layer_scope: None, gateway: AutoBool::No, ..view };
         flows.insert(id.clone(), view);
         assert_eq!(choices(&flows)[&id], Choice::Needed);
     }

@@ -1,4 +1,5 @@
-//! What a lane carries: the most that its requesters ask for, within what its publishers offer and the operator allows.
+//! What a lane carries: the most that its requesters ask for, within what its publishers offer and
+//! the operator allows.
 
 use std::collections::BTreeSet;
 
@@ -19,14 +20,14 @@ impl LaneBuilder {
         Self { rules }
     }
 
-    /// The lane for the given pairs of publisher and requester, each of which matches; `None` without a pair.
+    /// The lane for the given pairs of publisher and requester, each of which matches; `None`
+    /// without a pair.
     pub(super) fn lane<'p, 'w: 'p>(
         &self,
         pairs: impl Iterator<Item = (&'p Publisher<'w>, &'p Requester<'w>)>,
     ) -> Option<LaneSpec> {
-        let pairs: Vec<Pair<'p>> = pairs
-            .map(|(publisher, requester)| (publisher.advertise, requester.request))
-            .collect();
+        let pairs: Vec<Pair<'p>> =
+            pairs.map(|(publisher, requester)| (publisher.advertise, requester.request)).collect();
         if pairs.is_empty() {
             return None;
         }
@@ -92,9 +93,7 @@ fn lifespan(pairs: &[Pair<'_>]) -> u32 {
 
 /// The longest lifespan, where 0 is infinite.
 fn longer(lifespans: impl Iterator<Item = u32>) -> u32 {
-    lifespans
-        .reduce(|a, b| if a == 0 || b == 0 { 0 } else { a.max(b) })
-        .unwrap_or(0)
+    lifespans.reduce(|a, b| if a == 0 || b == 0 { 0 } else { a.max(b) }).unwrap_or(0)
 }
 
 /// The shorter lifespan, where 0 is infinite.
@@ -102,11 +101,13 @@ fn shorter(a: u32, b: u32) -> u32 {
     if a == 0 || b == 0 { a.max(b) } else { a.min(b) }
 }
 
-/// The highest class that is published, lowered to the highest that is asked for if every requester names one.
+/// The highest class that is published, lowered to the highest that is asked for if every requester
+/// names one.
 fn priority(pairs: &[Pair<'_>]) -> Option<Priority> {
     let asked: Option<Vec<Priority>> = pairs.iter().map(|(_, ask)| ask.priority).collect();
     let asked = asked.and_then(|asked| asked.into_iter().min());
-    // What says nothing is `state` unless it is large, so a publisher that says `bulk` does not lower it.
+    // What says nothing is `state` unless it is large, so a publisher that says `bulk` does not
+    // lower it.
     let named = pairs.iter().filter_map(|(offer, _)| offer.priority).min();
     let silent = pairs.iter().any(|(offer, _)| offer.priority.is_none());
     let offered = named.filter(|named| !silent || *named < Priority::Bulk);

@@ -7,12 +7,14 @@
 //!             └─► bridges, each with the lane that its requesters ask for; what is blocked, and why
 //! ```
 //!
-//! A *group* is the flows that reach each other over one layer broker; a flow without one is a group of its own. Each
-//! message crosses the inter scope once per other group that wants it, to one receiver, which writes its node scope for
-//! its own requesters and its layer scope for everybody else's. What crossed the inter scope never leaves a layer again.
+//! A *group* is the flows that reach each other over one layer broker; a flow without one is a
+//! group of its own. Each message crosses the inter scope once per other group that wants it, to
+//! one receiver, which writes its node scope for its own requesters and its layer scope for
+//! everybody else's. What crossed the inter scope never leaves a layer again.
 //!
-//! In a large group only some flows are on the inter scope, its [gateways](gateway). The others publish to the layer scope what
-//! flows of other groups ask for, and read there what those publish: to them, other groups are what a gateway says of them.
+//! In a large group only some flows are on the inter scope, its [gateways](gateway). The others
+//! publish to the layer scope what flows of other groups ask for, and read there what those
+//! publish: to them, other groups are what a gateway says of them.
 
 pub(crate) mod balance;
 pub mod gateway;
@@ -33,7 +35,9 @@ use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WhyCode};
 pub(crate) use lane::asks_too_much;
 pub use rules::PlanRules;
 pub use survey::Survey;
-pub(crate) use view::{Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail};
+pub(crate) use view::{
+    Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail,
+};
 
 use crate::world::{FlowState, LayerScopeId, OriginFilter, World};
 use lane::LaneBuilder;
@@ -43,10 +47,11 @@ use lane::LaneBuilder;
 pub struct TopicPlan {
     /// Bridges in the order of source and target; no two have both in common.
     pub bridges: Vec<Bridge>,
-    /// Requesters that get nothing, or not everything, and why; sorted, one entry per requester and code.
+    /// Requesters that get nothing, or not everything, and why; sorted, one entry per requester and
+    /// code.
     pub blocked: Vec<Blocked>,
-    /// Another flow of the group carries what is published on the layer scope to other groups, or is to; `None` where this
-    /// flow does, or nobody needs to.
+    /// Another flow of the group carries what is published on the layer scope to other groups, or
+    /// is to; `None` where this flow does, or nobody needs to.
     pub carrier: Option<FlowId>,
 }
 
@@ -63,17 +68,12 @@ impl TopicPlan {
         self.bridges.iter().any(Bridge::carries_out)
     }
 
-    /// Makes no bridge from or to the layer scope, because its broker cannot have the topic; says so to the layer, and to
-    /// the own node if it was to get the topic from there.
+    /// Makes no bridge from or to the layer scope, because its broker cannot have the topic; says
+    /// so to the layer, and to the own node if it was to get the topic from there.
     pub fn block_layer(&mut self, me: &FlowId, code: WhyCode, detail: &str) {
-        let blocked = |to| Blocked {
-            to,
-            code,
-            detail: detail.to_owned(),
-        };
-        let (gone, kept): (Vec<Bridge>, Vec<Bridge>) = std::mem::take(&mut self.bridges)
-            .into_iter()
-            .partition(Bridge::uses_layer);
+        let blocked = |to| Blocked { to, code, detail: detail.to_owned() };
+        let (gone, kept): (Vec<Bridge>, Vec<Bridge>) =
+            std::mem::take(&mut self.bridges).into_iter().partition(Bridge::uses_layer);
         self.bridges = kept;
         if !gone.is_empty() {
             self.blocked.push(blocked(Destination::Layer(me.layer.clone())));
@@ -82,8 +82,7 @@ impl TopicPlan {
             self.blocked.push(blocked(Destination::Flow(me.clone())));
         }
         self.blocked.sort();
-        self.blocked
-            .dedup_by(|next, kept| next.to == kept.to && next.code == kept.code);
+        self.blocked.dedup_by(|next, kept| next.to == kept.to && next.code == kept.code);
     }
 }
 
@@ -147,7 +146,8 @@ impl Target {
 pub struct LaneSpec {
     /// Highest rate that any requester takes, in messages per second; `None` = as published.
     pub max_rate_hz: Option<f64>,
-    /// The smaller of the publishers' and the longest requester's lifespan, in milliseconds; 0 = infinite.
+    /// The smaller of the publishers' and the longest requester's lifespan, in milliseconds; 0 =
+    /// infinite.
     pub lifespan_ms: u32,
     /// Lost messages are sent again.
     pub reliable: bool,
@@ -159,12 +159,14 @@ pub struct LaneSpec {
     pub priority: Option<Priority>,
     /// Origins that the requesters ask for, sorted; empty = any. Nothing else is carried.
     pub from: Vec<OriginFilter>,
-    /// Out of the layer: flows, sorted, that are not on the inter scope, so that what they wrote to the layer scope from their
-    /// own nodes is carried as if it was born there.
+    /// Out of the layer: flows, sorted, that are not on the inter scope, so that what they wrote to
+    /// the layer scope from their own nodes is carried as if it was born there.
     pub relays: Vec<FlowId>,
-    /// To another group: the layer broker that its flows share, so that another of them could be the receiver as well; `None`: it is alone.
+    /// To another group: the layer broker that its flows share, so that another of them could be
+    /// the receiver as well; `None`: it is alone.
     pub shared: Option<LayerScopeId>,
-    /// What it takes is held for the moment: another flow carries the same, and what is on its way there is not to be overtaken.
+    /// What it takes is held for the moment: another flow carries the same, and what is on its way
+    /// there is not to be overtaken.
     pub held: bool,
 }
 
@@ -216,11 +218,16 @@ pub struct Delivery {
 
 /// Plans what the flow `world.me` does for a topic.
 ///
-/// `previous` is the plan in effect: as long as its receivers are still eligible they are kept, until a better one is
-/// [settled](crate::world::FlowView::settled). Equal inputs give equal plans. A flow that is not `Ready` takes in nothing and
-/// has no bridges.
+/// `previous` is the plan in effect: as long as its receivers are still eligible they are kept,
+/// until a better one is [settled](crate::world::FlowView::settled). Equal inputs give equal plans.
+/// A flow that is not `Ready` takes in nothing and has no bridges.
 #[must_use]
-pub fn plan_topic(world: &World, topic: &TopicName, rules: &PlanRules, previous: Option<&TopicPlan>) -> TopicPlan {
+pub fn plan_topic(
+    world: &World,
+    topic: &TopicName,
+    rules: &PlanRules,
+    previous: Option<&TopicPlan>,
+) -> TopicPlan {
     plan_within(&Survey::new(world), topic, rules, previous)
 }
 
@@ -241,11 +248,7 @@ pub fn plan_within(
         return TopicPlan::default();
     };
     let lanes = LaneBuilder::new(rules.find(topic));
-    let mut plan = Planner {
-        view: &view,
-        lanes: &lanes,
-        bridges: BTreeMap::new(),
-    };
+    let mut plan = Planner { view: &view, lanes: &lanes, bridges: BTreeMap::new() };
     if world.own().is_some_and(|own| own.state == FlowState::Ready) {
         plan.read_node(previous);
         plan.read_layer(previous);
@@ -262,16 +265,17 @@ pub fn plan_within(
     }
 }
 
-/// What the flow `world.me` writes of a message from the inter scope, whether or not it would have been chosen to get it:
-/// views differ for a moment, and a sender stays with the receiver that it has.
+/// What the flow `world.me` writes of a message from the inter scope, whether or not it would have
+/// been chosen to get it: views differ for a moment, and a sender stays with the receiver that it
+/// has.
 #[must_use]
 pub fn delivery(world: &World, topic: &TopicName, rules: &PlanRules) -> Delivery {
-    TopicView::new(world, topic).map_or_else(Delivery::default, |view| {
-        deliver(&view, &LaneBuilder::new(rules.find(topic)))
-    })
+    TopicView::new(world, topic)
+        .map_or_else(Delivery::default, |view| deliver(&view, &LaneBuilder::new(rules.find(topic))))
 }
 
-/// The flow of `world.me`'s group that carries what services of the layer scope publish out of the layer.
+/// The flow of `world.me`'s group that carries what services of the layer scope publish out of the
+/// layer.
 #[must_use]
 pub fn owner(world: &World, topic: &TopicName) -> Option<FlowId> {
     TopicView::new(world, topic)?.owner().cloned()
@@ -280,7 +284,8 @@ pub fn owner(world: &World, topic: &TopicName) -> Option<FlowId> {
 fn deliver(view: &TopicView<'_>, lanes: &LaneBuilder) -> Delivery {
     let outside: Vec<_> = view.publishers_outside().collect();
     let node = view.own_node_requester();
-    let node_lane = node.and_then(|own| lanes.lane(view.pairs(outside.iter().copied(), std::iter::once(own))));
+    let node_lane =
+        node.and_then(|own| lanes.lane(view.pairs(outside.iter().copied(), std::iter::once(own))));
     Delivery {
         node_framed: node_lane.clone().filter(|_| node.is_some_and(|own| own.request.framed)),
         node_bare: node_lane.filter(|_| node.is_some_and(|own| own.request.bare)),
@@ -296,7 +301,8 @@ struct Planner<'a, 'w> {
 }
 
 impl Planner<'_, '_> {
-    /// What services of the own node publish: a bare copy beside it, to the own layer, to every other group.
+    /// What services of the own node publish: a bare copy beside it, to the own layer, to every
+    /// other group.
     fn read_node(&mut self, previous: Option<&TopicPlan>) {
         let Some(publisher) = self.view.own_node_publisher() else {
             return;
@@ -314,8 +320,8 @@ impl Planner<'_, '_> {
         self.send_to_other_groups(publisher, &[], previous);
     }
 
-    /// What is on the own layer scope: to the own node, and what was born there, or on a node that is not on the inter scope, to
-    /// every other group.
+    /// What is on the own layer scope: to the own node, and what was born there, or on a node that
+    /// is not on the inter scope, to every other group.
     fn read_layer(&mut self, previous: Option<&TopicPlan>) {
         if let Some(own) = self.view.own_node_requester() {
             let sources = self.view.publishers_over_own_layer(own);
@@ -326,11 +332,7 @@ impl Planner<'_, '_> {
             return;
         }
         let relayed: Vec<_> = self.view.relayed_publishers().collect();
-        let carried = self
-            .view
-            .own_layer_publisher()
-            .into_iter()
-            .chain(relayed.iter().copied());
+        let carried = self.view.own_layer_publisher().into_iter().chain(relayed.iter().copied());
         let Some(offer) = told::merge_offers(carried.map(|publisher| publisher.advertise)) else {
             return;
         };
@@ -366,7 +368,12 @@ impl Planner<'_, '_> {
     }
 
     /// One copy to one flow of each other group that asks for it.
-    fn send_to_other_groups(&mut self, publisher: &Publisher<'_>, relays: &[FlowId], previous: Option<&TopicPlan>) {
+    fn send_to_other_groups(
+        &mut self,
+        publisher: &Publisher<'_>,
+        relays: &[FlowId],
+        previous: Option<&TopicPlan>,
+    ) {
         let kept: Vec<&FlowId> = previous
             .iter()
             .flat_map(|plan| &plan.bridges)
@@ -389,10 +396,8 @@ impl Planner<'_, '_> {
             let Some(receiver) = self.view.next_receiver(publisher, group, &kept) else {
                 continue;
             };
-            let target = Target::Inter {
-                layer: receiver.layer.clone(),
-                receiver: receiver.clone(),
-            };
+            let target =
+                Target::Inter { layer: receiver.layer.clone(), receiver: receiver.clone() };
             self.put(publisher.scope, target, lane);
         }
     }

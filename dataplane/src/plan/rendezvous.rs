@@ -1,20 +1,31 @@
-//! Rendezvous hashing: all flows that see the same candidates choose the same one, without talking to each other.
+//! Rendezvous hashing: all flows that see the same candidates choose the same one, without talking
+//! to each other.
 //!
-//! When a candidate goes, only its topics move; when one comes, it takes its share and nothing else moves.
+//! When a candidate goes, only its topics move; when one comes, it takes its share and nothing else
+//! moves.
 
 use blaze_domain::FlowId;
 
-/// The candidate with the largest weight for a key, which is the topic unless said otherwise; of equal weights the smaller name. `None` without candidates.
-pub(crate) fn choose<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>) -> Option<&'a FlowId> {
+/// The candidate with the largest weight for a key, which is the topic unless said otherwise; of
+/// equal weights the smaller name. `None` without candidates.
+pub(crate) fn choose<'a>(
+    key: &str,
+    candidates: impl Iterator<Item = &'a FlowId>,
+) -> Option<&'a FlowId> {
     candidates.max_by(|a, b| weight(key, a).cmp(&weight(key, b)).then_with(|| b.cmp(a)))
 }
 
 /// The candidates with the largest weights for a key, at most so many, best first.
-pub(crate) fn best<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>, most: usize) -> Vec<&'a FlowId> {
+pub(crate) fn best<'a>(
+    key: &str,
+    candidates: impl Iterator<Item = &'a FlowId>,
+    most: usize,
+) -> Vec<&'a FlowId> {
     if most == 0 {
         return Vec::new();
     }
-    let mut ranked: Vec<(u64, &FlowId)> = candidates.map(|flow| (weight(key, flow), flow)).collect();
+    let mut ranked: Vec<(u64, &FlowId)> =
+        candidates.map(|flow| (weight(key, flow), flow)).collect();
     ranked.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(b.1)));
     ranked.truncate(most);
     ranked.into_iter().map(|(_, flow)| flow).collect()
@@ -26,8 +37,9 @@ fn weight(key: &str, flow: &FlowId) -> u64 {
     stable_hash(parts.iter().flat_map(|part| part.bytes().chain([0xFF])))
 }
 
-/// FNV-1a (64 bits), then the finaliser of SplitMix64, because FNV alone leaves the high bits of similar names alike, and sums of its values
-/// share their weak low bits. It is part of what flows agree on: a change of it moves topics between versions.
+/// FNV-1a (64 bits), then the finaliser of SplitMix64, because FNV alone leaves the high bits of
+/// similar names alike, and sums of its values share their weak low bits. It is part of what flows
+/// agree on: a change of it moves topics between versions.
 pub(crate) fn stable_hash(bytes: impl Iterator<Item = u8>) -> u64 {
     let mut hash = bytes.fold(0xCBF2_9CE4_8422_2325_u64, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01B3)

@@ -1,5 +1,5 @@
-//! What the plans of many topics have in common, so that it is looked for once: with a thousand flows of their own topics each,
-//! asking every flow for every topic takes seconds.
+//! What the plans of many topics have in common, so that it is looked for once: with a thousand
+//! flows of their own topics each, asking every flow for every topic takes seconds.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -46,11 +46,7 @@ impl<'w> Survey<'w> {
     /// For so many topics.
     #[must_use]
     pub fn of(world: &'w World, topics: usize) -> Self {
-        if topics < MANY {
-            Self::new(world)
-        } else {
-            Self::of_all(world)
-        }
+        if topics < MANY { Self::new(world) } else { Self::of_all(world) }
     }
 
     /// For many topics.
@@ -64,10 +60,7 @@ impl<'w> Survey<'w> {
                 by_topic.entry(topic).or_default().push(Holder { id, flow, entry });
             }
         }
-        Self {
-            by_topic: Some(by_topic),
-            ..Self::new(world)
-        }
+        Self { by_topic: Some(by_topic), ..Self::new(world) }
     }
 
     /// Flows, by name, that announced something of a topic or have a part in it.
@@ -77,12 +70,13 @@ impl<'w> Survey<'w> {
         holders.map(|holder| (holder.id, holder.flow)).collect()
     }
 
-    /// Whether anybody asks for a topic. Where that is not known without looking at every flow, it may be.
+    /// Whether anybody asks for a topic. Where that is not known without looking at every flow, it
+    /// may be.
     pub(super) fn may_be_requested(&self, topic: &TopicName) -> bool {
         let requested = |holder: &Holder<'_>| holder.entry.is_some_and(TopicEntry::is_requested);
-        self.by_topic
-            .as_ref()
-            .is_none_or(|by_topic| by_topic.get(topic).is_some_and(|holders| holders.iter().any(requested)))
+        self.by_topic.as_ref().is_none_or(|by_topic| {
+            by_topic.get(topic).is_some_and(|holders| holders.iter().any(requested))
+        })
     }
 
     /// The same as [`Survey::holders`], with what they announced.
@@ -106,15 +100,10 @@ impl<'w> Survey<'w> {
     ) -> impl Iterator<Item = (&'w FlowId, &'w FlowView, &'w TopicEntry)> + 's {
         let known = self.by_topic.as_ref().map(|by_topic| by_topic.get(topic));
         // Without an index every flow may be one, and looking into its topics is what takes time.
-        let all = self
-            .world
-            .flows
-            .iter()
-            .filter(move |_| known.is_none())
-            .map(|(id, flow)| {
-                let entry = None;
-                Holder { id, flow, entry }
-            });
+        let all = self.world.flows.iter().filter(move |_| known.is_none()).map(|(id, flow)| {
+            let entry = None;
+            Holder { id, flow, entry }
+        });
         let holders = known.flatten().into_iter().flatten().copied();
         let such = all.chain(holders).filter(move |holder| is_such(holder.id, holder.flow));
         such.filter_map(move |Holder { id, flow, entry }| {
@@ -155,17 +144,15 @@ mod tests {
 
     #[test]
     fn holders_are_the_same_with_and_without_an_index() {
-        let topics: Vec<TopicName> = ["a", "b", "c"].iter().map(|name| name.parse().unwrap()).collect();
+        let topics: Vec<TopicName> =
+            ["a", "b", "c"].iter().map(|name| name.parse().unwrap()).collect();
         let names = [("x/1", None), ("x/2", None), ("y/1", Some(1))];
         let mut world = World {
             me: id("x/1"),
             flows: names.map(|(name, scope)| (id(name), flow(scope))).into(),
             access: AccessRules::default(),
         };
-        let part = Part {
-            carrying: Carrying::Carries,
-            ..Part::default()
-        };
+        let part = Part { carrying: Carrying::Carries, ..Part::default() };
         for (number, view) in world.flows.values_mut().enumerate() {
             view.topics.insert(topics[number % 2].clone(), TopicEntry::default());
             view.parts.insert(topics[0].clone(), part.clone());

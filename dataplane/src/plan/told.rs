@@ -1,5 +1,5 @@
-//! What a gateway tells of flows that others cannot hear: outside of those of its group that are not on the inter scope, and
-//! those of the flows outside.
+//! What a gateway tells of flows that others cannot hear: outside of those of its group that are
+//! not on the inter scope, and those of the flows outside.
 
 use std::collections::BTreeSet;
 
@@ -11,11 +11,13 @@ use crate::world::{Advertise, FlowView, OriginFilter, Request, ScopeEntry, Sourc
 
 /// Most services that one merged entry lists.
 const MAX_SOURCES: usize = 256;
-/// Most different origin filters of one merged request; with more, messages of any origin are asked for.
+/// Most different origin filters of one merged request; with more, messages of any origin are asked
+/// for.
 const MAX_FILTERS: usize = 128;
 
-/// What the own flow tells flows of other groups of a topic: what its own services say, and as of its layer scope what those of
-/// the flows say that are not on the inter scope. `None` where nobody says anything.
+/// What the own flow tells flows of other groups of a topic: what its own services say, and as of
+/// its layer scope what those of the flows say that are not on the inter scope. `None` where nobody
+/// says anything.
 #[must_use]
 pub(crate) fn told_outside(survey: &Survey<'_>, topic: &TopicName) -> Option<TopicEntry> {
     let own = survey.world.own()?;
@@ -34,7 +36,8 @@ pub(crate) fn told_outside(survey: &Survey<'_>, topic: &TopicName) -> Option<Top
     (!told.is_empty()).then_some(told)
 }
 
-/// What the own flow tells flows of its group that are not on the inter scope: what other groups advertise and request.
+/// What the own flow tells flows of its group that are not on the inter scope: what other groups
+/// advertise and request.
 #[must_use]
 pub(crate) fn told_inside(survey: &Survey<'_>, topic: &TopicName) -> ScopeEntry {
     let Some(here) = survey.group().filter(|_| survey.speaks_for_others()) else {
@@ -61,14 +64,14 @@ fn merge<'a>(entries: impl IntoIterator<Item = &'a ScopeEntry>) -> ScopeEntry {
         offers.extend(&entry.advertise);
         requests.extend(&entry.request);
     }
-    ScopeEntry {
-        advertise: merge_offers(offers),
-        request: merge_requests(requests),
-    }
+    ScopeEntry { advertise: merge_offers(offers), request: merge_requests(requests) }
 }
 
-/// Advertisements of several scopes as one: sum of rates, largest size, strongest quality of service.
-pub(super) fn merge_offers<'a>(offers: impl IntoIterator<Item = &'a Advertise>) -> Option<Advertise> {
+/// Advertisements of several scopes as one: sum of rates, largest size, strongest quality of
+/// service.
+pub(super) fn merge_offers<'a>(
+    offers: impl IntoIterator<Item = &'a Advertise>,
+) -> Option<Advertise> {
     let mut offers = offers.into_iter().peekable();
     let first = offers.next()?;
     let mut merged = first.clone();
@@ -107,7 +110,8 @@ fn add_offer(merged: &mut Advertise, other: &Advertise) {
     merged.more_sources |= other.more_sources;
 }
 
-/// Requests of several scopes as one: highest rate, strongest quality of service, every origin that one of them asks for.
+/// Requests of several scopes as one: highest rate, strongest quality of service, every origin that
+/// one of them asks for.
 fn merge_requests<'a>(requests: impl IntoIterator<Item = &'a Request>) -> Option<Request> {
     let mut requests = requests.into_iter().peekable();
     let first = requests.next()?;
@@ -147,7 +151,8 @@ fn add_request(merged: &mut Request, other: &Request) {
     keep_same(&mut merged.type_hash, &other.type_hash);
 }
 
-/// A type or hash that both give; where they differ, none: nobody is to miss what another one's type keeps away.
+/// A type or hash that both give; where they differ, none: nobody is to miss what another one's
+/// type keeps away.
 fn keep_same(held: &mut String, other: &str) {
     if held != other {
         held.clear();
@@ -184,17 +189,11 @@ mod tests {
             layer.sources[0].node, "m",
             "members alone: other gateways speak for themselves"
         );
-        assert_eq!(
-            (layer.rate_hz, told.node.advertise.unwrap().rate_hz),
-            (Some(50.0), Some(50.0))
-        );
+        assert_eq!((layer.rate_hz, told.node.advertise.unwrap().rate_hz), (Some(50.0), Some(50.0)));
         assert!(told.layer.request.is_some() && told.node.request.is_none());
         world.flows.get_mut(&"c/a".parse().unwrap()).unwrap().role = Role::Leaving;
         let told = told_outside(&Survey::new(&world), &topic()).unwrap();
-        assert!(
-            told.layer.advertise.is_none(),
-            "one that leaves speaks for itself alone"
-        );
+        assert!(told.layer.advertise.is_none(), "one that leaves speaks for itself alone");
     }
 
     #[test]
@@ -212,25 +211,20 @@ mod tests {
         assert_eq!(told.advertise.unwrap().rate_hz, Some(50.0), "of the flow that lives");
         assert!(told.request.is_some());
         assert_eq!(inside(&["c/a@1", "c/b@1", "f/z node+"]), ScopeEntry::default());
-        assert_eq!(
-            inside(&["c/a@1 member", "c/m@1 member", "f/z node+"]),
-            ScopeEntry::default()
-        );
+        assert_eq!(inside(&["c/a@1 member", "c/m@1 member", "f/z node+"]), ScopeEntry::default());
     }
 
     #[test]
     fn merging_asks_for_the_most() {
         let mut world = world(&["c/a@1", "c/m@1 member node-", "c/n@1 member node-"]);
-        for (flow, text, rate) in [("c/m", "edge/*/driver", Some(5.0)), ("c/n", "fog/*/*", Some(7.0))] {
+        for (flow, text, rate) in
+            [("c/m", "edge/*/driver", Some(5.0)), ("c/n", "fog/*/*", Some(7.0))]
+        {
             let ask = crate::plan::tests::worlds::ask(&mut world, flow, "node");
             (ask.from, ask.max_rate_hz) = (vec![filter(text)], rate);
         }
         let asked = |world: &World| {
-            told_outside(&Survey::new(world), &topic())
-                .unwrap()
-                .layer
-                .request
-                .unwrap()
+            told_outside(&Survey::new(world), &topic()).unwrap().layer.request.unwrap()
         };
         assert_eq!((asked(&world).from.len(), asked(&world).max_rate_hz), (2, Some(7.0)));
         crate::plan::tests::worlds::ask(&mut world, "c/n", "node").from.clear();
@@ -240,10 +234,7 @@ mod tests {
     #[test]
     fn of_many_services_some_are_told_and_that_there_are_more() {
         let offer = |names: std::ops::Range<usize>| {
-            let source = |n| Source {
-                node: format!("n{n:04}"),
-                service: "s".to_owned(),
-            };
+            let source = |n| Source { node: format!("n{n:04}"), service: "s".to_owned() };
             let mut world = world(&["c/a@1 node+"]);
             let one = crate::plan::tests::worlds::offer(&mut world, "c/a", "node");
             one.sources = names.map(source).collect();

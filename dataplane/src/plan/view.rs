@@ -13,7 +13,8 @@ use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 use super::survey::Holder;
 use super::{Blocked, Destination, Survey, rendezvous};
 use crate::world::{
-    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, TopicEntry, World,
+    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request,
+    Role, TopicEntry, World,
 };
 
 /// Flows that reach each other over one layer broker.
@@ -27,8 +28,7 @@ pub(crate) enum Group<'w> {
 
 impl<'w> Group<'w> {
     pub(crate) fn of(id: &'w FlowId, flow: &FlowView) -> Self {
-        flow.layer_scope
-            .map_or(Self::Alone(id), |scope| Self::Shared(&id.layer, scope))
+        flow.layer_scope.map_or(Self::Alone(id), |scope| Self::Shared(&id.layer, scope))
     }
 }
 
@@ -87,10 +87,13 @@ impl Publisher<'_> {
 
     fn has_origin(&self, filter: &OriginFilter) -> bool {
         if self.scope == Scope::Inter {
-            // A gateway does not say which layers it speaks for; what comes is looked at one by one.
+            // A gateway does not say which layers it speaks for; what comes is looked at one by
+            // one.
             return true;
         }
-        let part = |wanted: &Option<String>, found: &str| wanted.as_deref().is_none_or(|wanted| wanted == found);
+        let part = |wanted: &Option<String>, found: &str| {
+            wanted.as_deref().is_none_or(|wanted| wanted == found)
+        };
         if !part(&filter.layer, self.flow.layer.as_str()) {
             return false;
         }
@@ -99,11 +102,10 @@ impl Publisher<'_> {
             return false;
         }
         self.advertise.more_sources
-            || self
-                .advertise
-                .sources
-                .iter()
-                .any(|source| part(&filter.service, &source.service) && (on_node || part(&filter.node, &source.node)))
+            || self.advertise.sources.iter().any(|source| {
+                part(&filter.service, &source.service)
+                    && (on_node || part(&filter.node, &source.node))
+            })
     }
 }
 
@@ -189,24 +191,17 @@ impl<'w> TopicView<'w> {
         // A flow knows that it lives; what it is told of itself does not count.
         let reachable = view.reach != Reach::Down || flow == self.me;
         let carries = reachable && view.state == FlowState::Ready;
-        let behind = flow != self.me && group == self.group && view.role.is_gateway() && !self.role.is_gateway();
+        let behind = flow != self.me
+            && group == self.group
+            && view.role.is_gateway()
+            && !self.role.is_gateway();
         let outside = (behind && carries).then_some((Scope::Inter, &entry.outside));
         for (scope, entry) in node.into_iter().chain(layer).chain(outside) {
             if let Some(advertise) = entry.advertise.as_ref().filter(|_| carries) {
-                self.publishers.push(Publisher {
-                    flow,
-                    group,
-                    scope,
-                    advertise,
-                });
+                self.publishers.push(Publisher { flow, group, scope, advertise });
             }
             if let Some(request) = &entry.request {
-                let requester = Requester {
-                    flow,
-                    group,
-                    scope,
-                    request,
-                };
+                let requester = Requester { flow, group, scope, request };
                 if carries && self.may_request(&requester) {
                     self.requesters.push(requester);
                 } else if carries {
@@ -236,7 +231,8 @@ impl<'w> TopicView<'w> {
             .find(|requester| requester.flow == self.me && requester.scope == Scope::Node)
     }
 
-    /// Everybody whom a message reaches that this flow writes to its layer scope: services there, other flows' services.
+    /// Everybody whom a message reaches that this flow writes to its layer scope: services there,
+    /// other flows' services.
     pub(crate) fn requesters_over_own_layer(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
         let of_layer = |requester: &Requester<'_>| match requester.scope {
             Scope::Layer => true,
@@ -258,29 +254,30 @@ impl<'w> TopicView<'w> {
         self.role == Role::Member && self.gateways.is_empty()
     }
 
-    /// Requesters of other groups, as gateways say, of which this flow is none: what it writes to its layer scope reaches them.
+    /// Requesters of other groups, as gateways say, of which this flow is none: what it writes to
+    /// its layer scope reaches them.
     pub(crate) fn requesters_over_gateways(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
-        self.requesters
-            .iter()
-            .filter(|requester| requester.scope == Scope::Inter)
+        self.requesters.iter().filter(|requester| requester.scope == Scope::Inter)
     }
 
-    /// Whether this flow has been on the inter scope since a moment only: another one still carries for it.
+    /// Whether this flow has been on the inter scope since a moment only: another one still carries
+    /// for it.
     pub(crate) fn enters(&self) -> bool {
         self.role == Role::NewGateway
     }
 
-    /// Requesters of other groups whom another flow still reaches for this one, if this one has been on the inter scope since a
-    /// moment only.
-    pub(crate) fn requesters_over_former_carrier(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
+    /// Requesters of other groups whom another flow still reaches for this one, if this one has
+    /// been on the inter scope since a moment only.
+    pub(crate) fn requesters_over_former_carrier(
+        &self,
+    ) -> impl Iterator<Item = &Requester<'w>> + Clone {
         let enters = self.enters();
-        self.requesters
-            .iter()
-            .filter(move |requester| enters && requester.group != self.group)
+        self.requesters.iter().filter(move |requester| enters && requester.group != self.group)
     }
 
-    /// Publishers on nodes of flows that are not on the inter scope, or were not until a moment ago: what they write to the
-    /// layer scope is carried out of it. What this flow wrote there itself it does not carry.
+    /// Publishers on nodes of flows that are not on the inter scope, or were not until a moment
+    /// ago: what they write to the layer scope is carried out of it. What this flow wrote there
+    /// itself it does not carry.
     pub(crate) fn relayed_publishers(&self) -> impl Iterator<Item = &Publisher<'w>> {
         // Of a thousand publishers hardly any is of the own group, so that is asked first.
         let relayed = |publisher: &&Publisher<'w>| {
@@ -293,16 +290,21 @@ impl<'w> TopicView<'w> {
         self.publishers.iter().filter(relayed)
     }
 
-    /// Whose messages reach the layer scope without this flow, given that its own node asks for them.
+    /// Whose messages reach the layer scope without this flow, given that its own node asks for
+    /// them.
     ///
-    /// A publisher outside counts if another flow could be its receiver, even where this one would be chosen: its sender
-    /// may stay with an earlier choice that only it knows.
-    pub(crate) fn publishers_over_own_layer(&self, own: &Requester<'w>) -> impl Iterator<Item = &Publisher<'w>> {
+    /// A publisher outside counts if another flow could be its receiver, even where this one would
+    /// be chosen: its sender may stay with an earlier choice that only it knows.
+    pub(crate) fn publishers_over_own_layer(
+        &self,
+        own: &Requester<'w>,
+    ) -> impl Iterator<Item = &Publisher<'w>> {
         self.publishers.iter().filter(move |publisher| {
             if publisher.group == self.group {
                 publisher.scope == Scope::Layer || publisher.flow != self.me
             } else {
-                publisher.matches(own) && self.candidates(publisher, self.group).any(|flow| flow != self.me)
+                publisher.matches(own)
+                    && self.candidates(publisher, self.group).any(|flow| flow != self.me)
             }
         })
     }
@@ -337,8 +339,8 @@ impl<'w> TopicView<'w> {
         })
     }
 
-    /// The flows of a group that could take in what the publisher sends: those with a requester of their own for it, on
-    /// their node scope or on the layer scope that they share.
+    /// The flows of a group that could take in what the publisher sends: those with a requester of
+    /// their own for it, on their node scope or on the layer scope that they share.
     pub(crate) fn candidates<'p>(
         &'p self,
         publisher: &'p Publisher<'w>,
@@ -346,11 +348,15 @@ impl<'w> TopicView<'w> {
     ) -> impl Iterator<Item = &'w FlowId> + use<'p, 'w> {
         let known = self.requesters.iter().chain(self.refused_elsewhere(publisher, group));
         let in_group = known.filter(move |requester| {
-            requester.group == group && requester.scope != Scope::Inter && publisher.matches(requester)
+            requester.group == group
+                && requester.scope != Scope::Inter
+                && publisher.matches(requester)
         });
         let behind = |requester: &&Requester<'w>| self.members.contains(requester.flow);
-        // For those that are not on the inter scope any gateway can: it writes to the layer scope for them.
-        let for_members = group == self.group && in_group.clone().any(|requester| behind(&requester));
+        // For those that are not on the inter scope any gateway can: it writes to the layer scope
+        // for them.
+        let for_members =
+            group == self.group && in_group.clone().any(|requester| behind(&requester));
         let leaving = iter::once(self.me).filter(|_| self.role == Role::Leaving);
         let gateways = self.gateways.iter().copied().chain(leaving);
         in_group
@@ -359,23 +365,30 @@ impl<'w> TopicView<'w> {
             .chain(gateways.filter(move |_| for_members))
     }
 
-    /// Those of the candidates whose layer broker answers them; all of them where that is so for none.
+    /// Those of the candidates whose layer broker answers them; all of them where that is so for
+    /// none.
     fn able_candidates<'p>(
         &'p self,
         publisher: &'p Publisher<'w>,
         group: Group<'w>,
     ) -> impl Iterator<Item = &'w FlowId> + use<'p, 'w> {
         // Of hardly any topic there is one.
-        let some = !self.away.is_empty() && self.candidates(publisher, group).any(|flow| !self.away.contains(&flow));
-        self.candidates(publisher, group)
-            .filter(move |flow| !some || !self.away.contains(flow))
+        let some = !self.away.is_empty()
+            && self.candidates(publisher, group).any(|flow| !self.away.contains(&flow));
+        self.candidates(publisher, group).filter(move |flow| !some || !self.away.contains(flow))
     }
 
-    /// The flow of a group that gets what the publisher sends: one of `kept` if it still could, else by rendezvous.
-    pub(crate) fn receiver(&self, publisher: &Publisher<'w>, group: Group<'w>, kept: &[&FlowId]) -> Option<&'w FlowId> {
-        self.able_candidates(publisher, group)
-            .find(|candidate| kept.contains(candidate))
-            .or_else(|| rendezvous::choose(self.topic.as_str(), self.able_candidates(publisher, group)))
+    /// The flow of a group that gets what the publisher sends: one of `kept` if it still could,
+    /// else by rendezvous.
+    pub(crate) fn receiver(
+        &self,
+        publisher: &Publisher<'w>,
+        group: Group<'w>,
+        kept: &[&FlowId],
+    ) -> Option<&'w FlowId> {
+        self.able_candidates(publisher, group).find(|candidate| kept.contains(candidate)).or_else(
+            || rendezvous::choose(self.topic.as_str(), self.able_candidates(publisher, group)),
+        )
     }
 
     /// The same for the sender, who leaves the one of `kept` for a better one that has settled.
@@ -390,7 +403,8 @@ impl<'w> TopicView<'w> {
         rendezvous::choose(self.topic.as_str(), self.able_candidates(publisher, group).filter(able))
     }
 
-    /// Whether this flow may get what a publisher outside sends: its sender says so, or would choose it.
+    /// Whether this flow may get what a publisher outside sends: its sender says so, or would
+    /// choose it.
     pub(crate) fn may_receive(&self, publisher: &Publisher<'w>) -> bool {
         if !self.candidates(publisher, self.group).any(|flow| flow == self.me) {
             return false;
@@ -408,7 +422,8 @@ impl<'w> TopicView<'w> {
 
     fn is_settled(&self, flow: &FlowId) -> bool {
         let view = self.world.flows.get(flow);
-        // What a flow wrote to the layer scope before it was a gateway it does not carry out itself.
+        // What a flow wrote to the layer scope before it was a gateway it does not carry out
+        // itself.
         view.is_some_and(|view| view.settled && view.role != Role::NewGateway)
     }
 
@@ -419,11 +434,14 @@ impl<'w> TopicView<'w> {
 
     /// The same of any group.
     ///
-    /// Whoever carries the topic stays until it gives it up: only this flow itself gives up what it carries, to the one that it
-    /// chose by load, to a better one that has settled, or to the better one of two that both do. Of a flow that is going away
-    /// its word is awaited, where the next one begins.
+    /// Whoever carries the topic stays until it gives it up: only this flow itself gives up what it
+    /// carries, to the one that it chose by load, to a better one that has settled, or to the
+    /// better one of two that both do. Of a flow that is going away its word is awaited, where the
+    /// next one begins.
     pub(crate) fn owner_in(&self, group: Group<'w>) -> Option<&'w FlowId> {
-        let of_group = |publisher: &&Publisher<'_>| publisher.group == group && publisher.scope == Scope::Layer;
+        let of_group = |publisher: &&Publisher<'_>| {
+            publisher.group == group && publisher.scope == Scope::Layer
+        };
         let own = group == self.group;
         let relays = own && self.relayed_publishers().next().is_some();
         let able = || {
@@ -432,7 +450,9 @@ impl<'w> TopicView<'w> {
                 .filter(|flow| !own || self.gateways.contains(flow))
                 .chain(self.gateways.iter().copied().filter(|_| relays))
         };
-        let choose = |flows: &mut dyn Iterator<Item = &'w FlowId>| rendezvous::choose(self.topic.as_str(), flows);
+        let choose = |flows: &mut dyn Iterator<Item = &'w FlowId>| {
+            rendezvous::choose(self.topic.as_str(), flows)
+        };
         let current = choose(&mut able().filter(|flow| self.carries_out(flow)));
         match current {
             Some(current) if current == self.me => self.successor(able()),
@@ -444,11 +464,11 @@ impl<'w> TopicView<'w> {
 
     /// Whether a flow says that it carries the topic out of its layer.
     fn carries_out(&self, flow: &FlowId) -> bool {
-        self.part_of(flow)
-            .is_some_and(|part| part.carrying == Carrying::Carries)
+        self.part_of(flow).is_some_and(|part| part.carrying == Carrying::Carries)
     }
 
-    /// A flow of a group that is going away, or is no gateway any more, and has not said yet where the next one begins.
+    /// A flow of a group that is going away, or is no gateway any more, and has not said yet where
+    /// the next one begins.
     fn leaving_carrier(&self, group: Group<'w>) -> Option<&'w FlowId> {
         let leaving = |Holder { id, flow, .. }: &&Holder<'w>| {
             (flow.state == FlowState::Draining || !flow.role.is_gateway())
@@ -460,11 +480,15 @@ impl<'w> TopicView<'w> {
         flows.find(|id| self.carries_out(id))
     }
 
-    /// The other flow of the own group that carries what is published on the layer scope to other groups, or is to; where
-    /// nobody there wants it, nobody.
+    /// The other flow of the own group that carries what is published on the layer scope to other
+    /// groups, or is to; where nobody there wants it, nobody.
     pub(crate) fn other_carrier(&self) -> Option<FlowId> {
-        let on_layer = |publisher: &&Publisher<'_>| publisher.group == self.group && publisher.scope == Scope::Layer;
-        let is_outside = |requester: &&Requester<'_>| requester.group != self.group || requester.scope == Scope::Inter;
+        let on_layer = |publisher: &&Publisher<'_>| {
+            publisher.group == self.group && publisher.scope == Scope::Layer
+        };
+        let is_outside = |requester: &&Requester<'_>| {
+            requester.group != self.group || requester.scope == Scope::Inter
+        };
         // Another flow does not know whom this one refuses.
         let outside = || self.requesters.iter().chain(&self.refused).filter(is_outside);
         let published = self.publishers.iter().filter(on_layer).chain(self.relayed_publishers());
@@ -492,8 +516,13 @@ impl<'w> TopicView<'w> {
                     ));
                 }
             }
-            let other_origin = |publisher: &Publisher<'_>| publisher.pairing(requester.request) == Pairing::OtherOrigin;
-            if (own || !sent.is_empty()) && !self.publishers.is_empty() && self.publishers.iter().all(other_origin) {
+            let other_origin = |publisher: &Publisher<'_>| {
+                publisher.pairing(requester.request) == Pairing::OtherOrigin
+            };
+            if (own || !sent.is_empty())
+                && !self.publishers.is_empty()
+                && self.publishers.iter().all(other_origin)
+            {
                 let detail = format!(
                     "none of {} publishing scopes has an origin that it asks for",
                     self.publishers.len()
@@ -502,10 +531,11 @@ impl<'w> TopicView<'w> {
             }
         }
         for requester in &self.lost_requesters {
-            let wanted = sent
-                .iter()
-                .any(|publisher| publisher.group != requester.group && publisher.matches(requester));
-            // A layer scope has other flows to reach it by; if it has none, nobody says that it is still there.
+            let wanted = sent.iter().any(|publisher| {
+                publisher.group != requester.group && publisher.matches(requester)
+            });
+            // A layer scope has other flows to reach it by; if it has none, nobody says that it is
+            // still there.
             if wanted && requester.scope == Scope::Node {
                 blocked.insert((
                     requester.destination(),
@@ -523,11 +553,14 @@ impl<'w> TopicView<'w> {
     }
 }
 
-/// Whether the services share a scope, so that no flow is between them (a bare copy is made by one).
+/// Whether the services share a scope, so that no flow is between them (a bare copy is made by
+/// one).
 pub(crate) fn meets_directly(publisher: &Publisher<'_>, requester: &Requester<'_>) -> bool {
     publisher.scope == requester.scope
         && match publisher.scope {
-            Scope::Node | Scope::Inter => publisher.flow == requester.flow && !requester.request.bare,
+            Scope::Node | Scope::Inter => {
+                publisher.flow == requester.flow && !requester.request.bare
+            }
             Scope::Layer => publisher.group == requester.group,
         }
 }
@@ -539,8 +572,5 @@ pub(crate) fn type_detail(publisher: &Publisher<'_>, requester: &Requester<'_>) 
     } else {
         (&offer.type_hash, &ask.type_hash)
     };
-    format!(
-        "{} advertises {offered}, {} requests {asked}",
-        publisher.flow, requester.flow
-    )
+    format!("{} advertises {offered}, {} requests {asked}", publisher.flow, requester.flow)
 }

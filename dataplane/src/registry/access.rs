@@ -1,5 +1,5 @@
-//! Who may advertise and request what: the rules of `flow.access`, where leases are granted. What is refused is remembered for
-//! people who ask.
+//! Who may advertise and request what: the rules of `flow.access`, where leases are granted. What
+//! is refused is remembered for people who ask.
 
 use std::time::Instant;
 
@@ -20,8 +20,8 @@ impl Registry {
         self.world.access.of(topic)
     }
 
-    /// Changes the rules. Leases that they do not allow end. All topics are to be planned anew: the rules hold for requesters of
-    /// other flows, too.
+    /// Changes the rules. Leases that they do not allow end. All topics are to be planned anew: the
+    /// rules hold for requesters of other flows, too.
     pub fn set_access(&mut self, now: Instant, access: AccessRules) -> Changes {
         self.world.access = access;
         let denied = self.leases.end_denied(now, &self.world.access);
@@ -33,14 +33,11 @@ impl Registry {
         });
         let events = events.collect();
         let changed = self.refresh(now, denied.iter().map(|lease| lease.topic.clone()).collect());
-        Changes {
-            events,
-            changed,
-            lapsed: denied,
-        }
+        Changes { events, changed, lapsed: denied }
     }
 
-    /// Whether whoever sends a message is where it came from, and may have the lease that it asks for.
+    /// Whether whoever sends a message is where it came from, and may have the lease that it asks
+    /// for.
     pub(super) fn check_access(
         &mut self,
         now: Instant,
@@ -57,7 +54,13 @@ impl Registry {
             Ok(key) => key,
             Err(elsewhere) => {
                 let key = key_here(scope, &self.config.me, kind, common);
-                self.note_refused(now, &common.topic, key, LapseReason::SourceMismatch, &elsewhere.detail);
+                self.note_refused(
+                    now,
+                    &common.topic,
+                    key,
+                    LapseReason::SourceMismatch,
+                    &elsewhere.detail,
+                );
                 return Err(elsewhere);
             }
         };
@@ -66,14 +69,11 @@ impl Registry {
         }
         let detail = self.denial(&common.topic, &key);
         self.note_refused(now, &common.topic, key, LapseReason::Denied, &detail);
-        Err(ControlError::new(
-            ErrorCode::AccessDenied,
-            format!("{pointer}/service"),
-            detail,
-        ))
+        Err(ControlError::new(ErrorCode::AccessDenied, format!("{pointer}/service"), detail))
     }
 
-    /// Takes the topic's name on the broker that a message came from, for the lease that it asks for.
+    /// Takes the topic's name on the broker that a message came from, for the lease that it asks
+    /// for.
     pub(super) fn check_name(
         &mut self,
         now: Instant,
@@ -89,7 +89,9 @@ impl Registry {
             return Ok(());
         };
         let (code, reason) = match fault {
-            NameFault::TooLong { .. } => (ErrorCode::NameNotExpressible, LapseReason::NameNotExpressible),
+            NameFault::TooLong { .. } => {
+                (ErrorCode::NameNotExpressible, LapseReason::NameNotExpressible)
+            }
             NameFault::Collision { .. } => (ErrorCode::NameCollision, LapseReason::NameCollision),
         };
         let detail = fault.to_string();
@@ -98,7 +100,14 @@ impl Registry {
         Err(ControlError::new(code, format!("{pointer}/topic"), detail))
     }
 
-    fn note_refused(&mut self, now: Instant, topic: &TopicName, key: LeaseKey, reason: LapseReason, detail: &str) {
+    fn note_refused(
+        &mut self,
+        now: Instant,
+        topic: &TopicName,
+        key: LeaseKey,
+        reason: LapseReason,
+        detail: &str,
+    ) {
         self.leases.remember(LapsedLease {
             topic: topic.clone(),
             key,

@@ -5,8 +5,9 @@
 //! SnapshotRequest ─► request: parts of one version, which is kept until it is no longer asked for
 //! ```
 //!
-//! Others follow no more than [`MAX_ENTRIES`] topics of a flow, so no more are announced: what does not fit waits until something
-//! goes. What is announced stays, unless something of a higher [`Rank`] needs its place.
+//! Others follow no more than [`MAX_ENTRIES`] topics of a flow, so no more are announced: what does
+//! not fit waits until something goes. What is announced stays, unless something of a higher
+//! [`Rank`] needs its place.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -27,7 +28,8 @@ const REACH_BACK: usize = 8;
 pub(super) const MAX_LEASED_ENTRIES: usize = 10_000;
 /// Most topics that it announces only to tell of their routes.
 const MAX_ROUTE_ENTRIES: usize = 2_000;
-/// Most topics that any flow announces; what those leave a gateway has for the topics of others that it speaks for.
+/// Most topics that any flow announces; what those leave a gateway has for the topics of others
+/// that it speaks for.
 pub(super) const MAX_ENTRIES: usize = MAX_LEASED_ENTRIES + MAX_ROUTE_ENTRIES;
 /// Parts of a snapshot that may be asked for at a time.
 pub(super) const MAX_ASKED_PARTS: usize = 8;
@@ -113,11 +115,7 @@ impl Announcer {
 
     /// How many topics [`Announcer::announce`] would look at now.
     pub(super) fn count_due(&self, now: Instant) -> usize {
-        if self.due.is_some_and(|due| due <= now) {
-            self.dirty.len()
-        } else {
-            0
-        }
+        if self.due.is_some_and(|due| due <= now) { self.dirty.len() } else { 0 }
     }
 
     /// A topic may have changed.
@@ -131,9 +129,13 @@ impl Announcer {
         self.due
     }
 
-    /// Takes the changes into the announced state; the parts of the Delta to send, if any. `current` gives what is to be told of
-    /// a topic, `None` where nothing is left of it.
-    pub(super) fn announce(&mut self, now: Instant, current: impl Fn(&TopicName) -> Option<Told>) -> Vec<wire::Delta> {
+    /// Takes the changes into the announced state; the parts of the Delta to send, if any.
+    /// `current` gives what is to be told of a topic, `None` where nothing is left of it.
+    pub(super) fn announce(
+        &mut self,
+        now: Instant,
+        current: impl Fn(&TopicName) -> Option<Told>,
+    ) -> Vec<wire::Delta> {
         if self.due.is_none_or(|due| due > now) {
             return Vec::new();
         }
@@ -142,7 +144,8 @@ impl Announcer {
         for topic in std::mem::take(&mut self.dirty) {
             self.take(&topic, current(&topic), &mut changed);
         }
-        // One that is looked at again is announced, gone, or waits for what there is no room for: that comes to an end.
+        // One that is looked at again is announced, gone, or waits for what there is no room for:
+        // that comes to an end.
         loop {
             let next = self.have_room();
             if next.is_empty() {
@@ -163,7 +166,8 @@ impl Announcer {
         self.delta()
     }
 
-    /// Takes what is told of one topic now; what others are to hear of because of it goes to `changed`.
+    /// Takes what is told of one topic now; what others are to hear of because of it goes to
+    /// `changed`.
     fn take(&mut self, topic: &TopicName, told: Option<Told>, changed: &mut BTreeSet<TopicName>) {
         let old = self.remove(topic);
         let waited = self.stop_waiting(topic);
@@ -205,8 +209,15 @@ impl Announcer {
         waited
     }
 
-    /// Whether there is room for a topic, or another one gave way; else it waits, and is counted unless it `waited` before.
-    fn makes_room(&mut self, topic: &TopicName, told: &Told, waited: bool, changed: &mut BTreeSet<TopicName>) -> bool {
+    /// Whether there is room for a topic, or another one gave way; else it waits, and is counted
+    /// unless it `waited` before.
+    fn makes_room(
+        &mut self,
+        topic: &TopicName,
+        told: &Told,
+        waited: bool,
+        changed: &mut BTreeSet<TopicName>,
+    ) -> bool {
         if only_routes(&told.entry) && self.route_entries >= MAX_ROUTE_ENTRIES {
             self.waiting_routes.insert(topic.clone());
             self.left_out.routes += u64::from(!waited);
@@ -233,10 +244,7 @@ impl Announcer {
         let room = MAX_ENTRIES.saturating_sub(self.entries.len());
         let routes = MAX_ROUTE_ENTRIES.saturating_sub(self.route_entries).min(room);
         let waiting = self.waiting.iter().take(room).map(|(_, topic)| topic);
-        waiting
-            .chain(self.waiting_routes.iter().take(routes))
-            .cloned()
-            .collect()
+        waiting.chain(self.waiting_routes.iter().take(routes)).cloned().collect()
     }
 
     /// The Delta to the newest version, from as far back as costs no further datagram.
@@ -275,7 +283,11 @@ impl Announcer {
     }
 
     /// The parts of a snapshot that another flow asks for.
-    pub(super) fn request(&mut self, now: Instant, request: &wire::SnapshotRequest) -> Vec<wire::Snapshot> {
+    pub(super) fn request(
+        &mut self,
+        now: Instant,
+        request: &wire::SnapshotRequest,
+    ) -> Vec<wire::Snapshot> {
         let wanted: Vec<u32> = if request.parts.is_empty() {
             (0..).take(MAX_ASKED_PARTS).collect()
         } else {
@@ -293,24 +305,15 @@ impl Announcer {
         let parts = u32::try_from(held.parts.len()).unwrap_or(u32::MAX);
         let part_of = |part: u32| {
             let entries = held.parts.get(usize::try_from(part).ok()?)?.clone();
-            Some(wire::Snapshot {
-                version: held.version,
-                part,
-                parts,
-                entries,
-            })
+            Some(wire::Snapshot { version: held.version, part, parts, entries })
         };
-        wanted
-            .into_iter()
-            .collect::<BTreeSet<_>>()
-            .into_iter()
-            .filter_map(part_of)
-            .collect()
+        wanted.into_iter().collect::<BTreeSet<_>>().into_iter().filter_map(part_of).collect()
     }
 
     fn newest_snapshot(&mut self, now: Instant) -> usize {
         let fresh = |held: &HeldSnapshot| {
-            held.version == self.version || now.saturating_duration_since(held.made) < SNAPSHOT_FRESH
+            held.version == self.version
+                || now.saturating_duration_since(held.made) < SNAPSHOT_FRESH
         };
         let newest = self.snapshots.iter().enumerate().max_by_key(|(_, held)| held.version);
         if let Some((index, held)) = newest
@@ -319,16 +322,15 @@ impl Announcer {
             return index;
         }
         if self.snapshots.len() >= MAX_SNAPSHOTS
-            && let Some((oldest, _)) = self.snapshots.iter().enumerate().min_by_key(|(_, held)| held.used)
+            && let Some((oldest, _)) =
+                self.snapshots.iter().enumerate().min_by_key(|(_, held)| held.used)
         {
             self.snapshots.swap_remove(oldest);
         }
         self.snapshots.push(HeldSnapshot {
             version: self.version,
             parts: pack(
-                self.entries
-                    .values()
-                    .flat_map(|announced| pieces(announced.told.entry.clone())),
+                self.entries.values().flat_map(|announced| pieces(announced.told.entry.clone())),
             ),
             made: now,
             used: now,
@@ -338,8 +340,7 @@ impl Announcer {
 
     /// Forgets snapshots that nobody asks for any more.
     pub(super) fn tidy(&mut self, now: Instant) {
-        self.snapshots
-            .retain(|held| now.saturating_duration_since(held.used) < SNAPSHOT_UNUSED);
+        self.snapshots.retain(|held| now.saturating_duration_since(held.used) < SNAPSHOT_UNUSED);
     }
 }
 

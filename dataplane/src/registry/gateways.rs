@@ -1,5 +1,5 @@
-//! Flows of the own group that are on the inter scope for the others, and those that are not: who is which, and what each side
-//! is told of the other.
+//! Flows of the own group that are on the inter scope for the others, and those that are not: who
+//! is which, and what each side is told of the other.
 //!
 //! ```text
 //! own entry ─────────────────────────┬─► announced on the channel of the layer broker
@@ -33,8 +33,8 @@ const SAID: Duration = Duration::from_millis(100);
 /// What a flow wrote to its layer scope before it became a gateway is carried out for it this long.
 pub(crate) const GRACE: Duration = Duration::from_secs(2);
 
-/// How long a flow waits before it asks for what one of so many others has announced on the channel of the layer broker: of many
-/// that miss the same, one asks, and all hear the answer.
+/// How long a flow waits before it asks for what one of so many others has announced on the channel
+/// of the layer broker: of many that miss the same, one asks, and all hear the answer.
 pub(super) fn patience(me: &FlowId, others: usize, with: &FlowId) -> Duration {
     let others = u64::try_from(others).unwrap_or(u64::MAX);
     let longest = others.saturating_mul(PATIENCE_MS).min(MAX_PATIENCE_MS);
@@ -43,23 +43,24 @@ pub(super) fn patience(me: &FlowId, others: usize, with: &FlowId) -> Duration {
 }
 
 impl Registry {
-    /// What the node file says of this flow as a gateway, and what it is. Returns the topics to plan anew.
+    /// What the node file says of this flow as a gateway, and what it is. Returns the topics to
+    /// plan anew.
     pub fn set_role(&mut self, gateway: AutoBool, role: Role) -> BTreeSet<TopicName> {
         match self.own_view() {
-            Some(own) if (own.gateway, own.role) != (gateway, role) => (own.gateway, own.role) = (gateway, role),
+            Some(own) if (own.gateway, own.role) != (gateway, role) => {
+                (own.gateway, own.role) = (gateway, role)
+            }
             _ => return BTreeSet::new(),
         }
         self.all_topics()
     }
 
-    /// This flow is not on the inter scope any more: whom it knew over that alone is forgotten. Returns the topics to plan anew.
+    /// This flow is not on the inter scope any more: whom it knew over that alone is forgotten.
+    /// Returns the topics to plan anew.
     pub fn leave_link(&mut self, now: Instant) -> BTreeSet<TopicName> {
         let mut changed = BTreeSet::new();
-        let (here, gone): (Vec<FlowId>, Vec<FlowId>) = self
-            .remotes
-            .keys()
-            .cloned()
-            .partition(|flow| self.is_heard_on_layer(flow));
+        let (here, gone): (Vec<FlowId>, Vec<FlowId>) =
+            self.remotes.keys().cloned().partition(|flow| self.is_heard_on_layer(flow));
         for flow in gone {
             changed.extend(self.forget(now, &flow));
         }
@@ -78,14 +79,16 @@ impl Registry {
         self.layer_announcer.announced()
     }
 
-    /// Another flow said something else of these topics: what a gateway tells of them may be different, too.
+    /// Another flow said something else of these topics: what a gateway tells of them may be
+    /// different, too.
     pub(super) fn tell_anew(&mut self, now: Instant, topics: &BTreeSet<TopicName>) {
         if self.speaks_for_others {
             topics.iter().for_each(|topic| self.mark(now, topic));
         }
     }
 
-    /// Another flow has come, changed, or is about to be forgotten: the same of all that it announced.
+    /// Another flow has come, changed, or is about to be forgotten: the same of all that it
+    /// announced.
     pub(super) fn tell_of(&mut self, now: Instant, flow: &FlowId) {
         if self.speaks_for_others
             && let Some(view) = self.world.flows.get(flow)
@@ -134,7 +137,8 @@ impl Registry {
                 (None, None, Some(_)) => Rank::Merged,
                 (None, None, None) => return None,
             };
-            let entry = wire::to_wire(topic, &entry.unwrap_or_default(), routes.unwrap_or_default());
+            let entry =
+                wire::to_wire(topic, &entry.unwrap_or_default(), routes.unwrap_or_default());
             Some(Told { entry, rank })
         };
         let deltas = self
@@ -162,8 +166,13 @@ impl Registry {
         self.remotes.get(flow).is_some_and(|remote| remote.ways.layer.is_some())
     }
 
-    /// Whether a flow that was heard there is not any more, and says on the inter scope that it has another layer broker, or none.
-    pub(super) fn has_left_layer(&self, flow: &FlowId, says: Option<crate::world::LayerScopeId>) -> bool {
+    /// Whether a flow that was heard there is not any more, and says on the inter scope that it has
+    /// another layer broker, or none.
+    pub(super) fn has_left_layer(
+        &self,
+        flow: &FlowId,
+        says: Option<crate::world::LayerScopeId>,
+    ) -> bool {
         let own = self.world.own().and_then(|own| own.layer_scope);
         let sign = self.remotes.get(flow).and_then(|remote| remote.ways.layer);
         sign.is_some_and(|sign| sign.over) && says != own
@@ -176,21 +185,22 @@ impl Registry {
         u32::try_from(reached.filter(|remote| remote.ways.over_link()).count()).unwrap_or(u32::MAX)
     }
 
-    /// Whether this flow reaches nobody over the inter scope while another gateway of its group does: its way there is broken, and
-    /// not that of all.
+    /// Whether this flow reaches nobody over the inter scope while another gateway of its group
+    /// does: its way there is broken, and not that of all.
     #[must_use]
     pub fn is_cut_off(&self) -> bool {
         let gateway = |flow: &FlowId| {
             let view = self.world.flows.get(flow);
             view.is_some_and(|view| {
-                view.role.is_gateway() && view.reach == crate::world::Reach::Up && view.state == FlowState::Ready
+                view.role.is_gateway()
+                    && view.reach == crate::world::Reach::Up
+                    && view.state == FlowState::Ready
             })
         };
         self.link_peers() == 0
-            && self
-                .remotes
-                .iter()
-                .any(|(flow, remote)| remote.ways.over_layer() && remote.link_peers > 0 && gateway(flow))
+            && self.remotes.iter().any(|(flow, remote)| {
+                remote.ways.over_layer() && remote.link_peers > 0 && gateway(flow)
+            })
     }
 
     /// A flow whose process goes on has a new life on the inter scope: what it has announced stays.
@@ -201,7 +211,8 @@ impl Registry {
         }
     }
 
-    /// Whether a part of a snapshot is to be said on the channel of the layer broker: not again right after it was.
+    /// Whether a part of a snapshot is to be said on the channel of the layer broker: not again
+    /// right after it was.
     pub(super) fn say_part(&mut self, now: Instant, version: u64, part: u32) -> bool {
         let fresh = |at: &Instant| now.saturating_duration_since(*at) < SAID;
         self.said_parts.retain(|_, at| fresh(at));
@@ -209,7 +220,12 @@ impl Registry {
     }
 
     /// What a flow says of itself on the channel of the layer broker.
-    pub(super) fn said_role(&mut self, now: Instant, from: &FlowId, hello: &Hello) -> (AutoBool, Role) {
+    pub(super) fn said_role(
+        &mut self,
+        now: Instant,
+        from: &FlowId,
+        hello: &Hello,
+    ) -> (AutoBool, Role) {
         let setting = match hello.gateway() {
             Gateway::Auto => AutoBool::Auto,
             Gateway::Never => AutoBool::No,
@@ -238,11 +254,8 @@ impl Registry {
     pub(super) fn end_of_grace(&mut self, now: Instant) -> bool {
         let mut ended = false;
         for (flow, remote) in &mut self.remotes {
-            let Some(view) = self
-                .world
-                .flows
-                .get_mut(flow)
-                .filter(|view| view.role == Role::NewGateway)
+            let Some(view) =
+                self.world.flows.get_mut(flow).filter(|view| view.role == Role::NewGateway)
             else {
                 continue;
             };

@@ -19,8 +19,8 @@ pub(super) fn key_of(
     Ok(key_here(scope, me, kind, common))
 }
 
-/// The same for a message that is refused: of one from elsewhere the key that it would have if it was from here, so that a right one
-/// takes its place.
+/// The same for a message that is refused: of one from elsewhere the key that it would have if it
+/// was from here, so that a right one takes its place.
 pub(super) fn key_here(scope: Scope, me: &FlowId, kind: LeaseKind, common: &Common) -> LeaseKey {
     LeaseKey {
         scope,
@@ -74,7 +74,8 @@ pub(super) fn lease_of<'m>(
             },
         ),
         ControlMessage::Withdraw(_) => {
-            let error = ControlError::new(ErrorCode::UnknownOp, pointer, "a withdrawal grants nothing");
+            let error =
+                ControlError::new(ErrorCode::UnknownOp, pointer, "a withdrawal grants nothing");
             return Err(error);
         }
     };
@@ -89,10 +90,17 @@ pub(super) fn lease_of<'m>(
 }
 
 /// Whoever speaks is where it was received, unless it says otherwise and may.
-fn check_source(scope: Scope, me: &FlowId, common: &Common, pointer: &str) -> Result<(), ControlError> {
+fn check_source(
+    scope: Scope,
+    me: &FlowId,
+    common: &Common,
+    pointer: &str,
+) -> Result<(), ControlError> {
     let (field, found, here) = match (&common.layer, &common.node) {
         (Some(layer), _) if *layer != me.layer => ("layer", layer.as_str(), me.layer.as_str()),
-        (_, Some(node)) if scope == Scope::Node && *node != me.node => ("node", node.as_str(), me.node.as_str()),
+        (_, Some(node)) if scope == Scope::Node && *node != me.node => {
+            ("node", node.as_str(), me.node.as_str())
+        }
         _ => return Ok(()),
     };
     Err(ControlError::new(

@@ -35,8 +35,8 @@ impl LeaseTable {
         }
     }
 
-    /// Forgets the leases of a scope, without a word to the broker that keeps them: it belongs to another flow, whose they
-    /// are now. Once it is ours again they are to be read.
+    /// Forgets the leases of a scope, without a word to the broker that keeps them: it belongs to
+    /// another flow, whose they are now. Once it is ours again they are to be read.
     pub(super) fn give_up(&mut self, scope: Scope) {
         for leases in self.topics.values_mut() {
             let before = leases.len();
@@ -58,7 +58,8 @@ impl LeaseTable {
             self.not_renewable.insert(scope);
         } else if self.not_renewable.remove(&scope) {
             let finite = self.expiry.iter().filter(|(_, _, key)| key.scope == scope);
-            let finite: Vec<_> = finite.map(|(_, topic, key)| (topic.clone(), key.clone())).collect();
+            let finite: Vec<_> =
+                finite.map(|(_, topic, key)| (topic.clone(), key.clone())).collect();
             for (topic, key) in finite {
                 self.renew(now, &topic, &key);
             }
@@ -79,7 +80,13 @@ impl LeaseTable {
     }
 
     /// Takes a lease that a broker has kept, unless a service was faster.
-    pub(super) fn restore(&mut self, now: Instant, scope: Scope, me: &FlowId, message: &ControlMessage) -> Taken {
+    pub(super) fn restore(
+        &mut self,
+        now: Instant,
+        scope: Scope,
+        me: &FlowId,
+        message: &ControlMessage,
+    ) -> Taken {
         let Ok((topic, key, lease)) = lease_of(now, scope, me, message, "") else {
             return Taken::Refused;
         };

@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
 use blaze_domain::control::{
-    AdvertiseMessage, Common, ControlError, ControlMessage, ErrorCode, LeaseKind, OriginSelector, Quality,
-    RequestMessage,
+    AdvertiseMessage, Common, ControlError, ControlMessage, ErrorCode, LeaseKind, OriginSelector,
+    Quality, RequestMessage,
 };
 use blaze_domain::node_file::{AccessRules, TopicAccess};
 use blaze_domain::{FlowId, InstanceName, LayerName, NodeName, Scope, ServiceName, TopicName};
@@ -15,7 +15,8 @@ use super::holder::{key_of, lease_of};
 /// Most lapsed leases that are remembered for people who ask why a topic stopped.
 const MAX_LAPSED: usize = 1024;
 
-/// Who holds a lease of a topic. The scope belongs to it: the same service may be on both brokers of a node.
+/// Who holds a lease of a topic. The scope belongs to it: the same service may be on both brokers
+/// of a node.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct LeaseKey {
     /// Where it was received.
@@ -122,30 +123,25 @@ impl<'a> LeaseView<'a> {
         };
         let ttl_s = self.ttl_s;
         match self.terms.clone() {
-            Terms::Advertise {
-                rate_hz,
-                max_bytes,
-                quality,
-            } => ControlMessage::Advertise(AdvertiseMessage {
-                common,
-                ttl_s,
-                rate_hz,
-                max_bytes,
-                quality,
-            }),
-            Terms::Request {
-                max_rate_hz,
-                bare,
-                from,
-                quality,
-            } => ControlMessage::Request(RequestMessage {
-                common,
-                ttl_s,
-                max_rate_hz,
-                bare,
-                from,
-                quality,
-            }),
+            Terms::Advertise { rate_hz, max_bytes, quality } => {
+                ControlMessage::Advertise(AdvertiseMessage {
+                    common,
+                    ttl_s,
+                    rate_hz,
+                    max_bytes,
+                    quality,
+                })
+            }
+            Terms::Request { max_rate_hz, bare, from, quality } => {
+                ControlMessage::Request(RequestMessage {
+                    common,
+                    ttl_s,
+                    max_rate_hz,
+                    bare,
+                    from,
+                    quality,
+                })
+            }
         }
     }
 }
@@ -213,15 +209,14 @@ pub(super) struct Applied {
 impl LeaseTable {
     /// A table without leases; those that the brokers of `stores` keep are still to be read.
     pub(super) fn new(limit: usize, stores: BTreeSet<Scope>) -> Self {
-        Self {
-            limit,
-            reading: stores.clone(),
-            stores,
-            ..Self::default()
-        }
+        Self { limit, reading: stores.clone(), stores, ..Self::default() }
     }
 
-    pub(super) fn get<'a>(&'a self, topic: &'a TopicName, key: &'a LeaseKey) -> Option<LeaseView<'a>> {
+    pub(super) fn get<'a>(
+        &'a self,
+        topic: &'a TopicName,
+        key: &'a LeaseKey,
+    ) -> Option<LeaseView<'a>> {
         let lease = self.topics.get(topic)?.get(key)?;
         Some(view(topic, key, lease))
     }
@@ -273,8 +268,9 @@ impl LeaseTable {
     ) -> Result<bool, ControlError> {
         let held = self.topics.get(topic).and_then(|leases| leases.get(&key));
         // A mere renewal changes nothing of what is kept.
-        let unsaved =
-            held.is_none_or(|held| (held.epoch, held.ttl_s) != (lease.epoch, lease.ttl_s) || held.terms != lease.terms);
+        let unsaved = held.is_none_or(|held| {
+            (held.epoch, held.ttl_s) != (lease.epoch, lease.ttl_s) || held.terms != lease.terms
+        });
         let changed = match held {
             Some(held) => {
                 check_epoch(held, lease.epoch, pointer)?;
@@ -385,8 +381,7 @@ impl LeaseTable {
 
     /// Notes for people who ask that a lease is missing.
     pub(super) fn remember(&mut self, lease: LapsedLease) {
-        self.lapsed
-            .retain(|other| other.topic != lease.topic || other.key != lease.key);
+        self.lapsed.retain(|other| other.topic != lease.topic || other.key != lease.key);
         if self.lapsed.len() == MAX_LAPSED {
             self.lapsed.pop_front();
         }
@@ -408,8 +403,9 @@ impl LeaseTable {
             }));
         }
         // Who is allowed now only has to ask again.
-        self.lapsed
-            .retain(|lease| lease.reason != LapseReason::Denied || !lease.key.may(&rules.of(&lease.topic)));
+        self.lapsed.retain(|lease| {
+            lease.reason != LapseReason::Denied || !lease.key.may(&rules.of(&lease.topic))
+        });
         for lease in &denied {
             self.remove(&lease.topic, &lease.key);
             self.note_end(&lease.topic, &lease.key);
@@ -422,7 +418,8 @@ impl LeaseTable {
         self.expiry.first().map(|(at, _, _)| *at)
     }
 
-    /// Leases that lapsed or were refused and were not made anew, newest first: what is the matter now hides what was before.
+    /// Leases that lapsed or were refused and were not made anew, newest first: what is the matter
+    /// now hides what was before.
     pub(super) fn lapsed(&self, topic: &TopicName) -> impl Iterator<Item = &LapsedLease> {
         self.lapsed.iter().rev().filter(move |lease| {
             lease.topic == *topic
@@ -433,17 +430,19 @@ impl LeaseTable {
         })
     }
 
-    pub(super) fn of_topic(&self, topic: &TopicName) -> impl Iterator<Item = LeaseView<'_>> + Clone {
-        self.topics
-            .get_key_value(topic)
-            .into_iter()
-            .flat_map(|(topic, leases)| leases.iter().map(move |(key, lease)| view(topic, key, lease)))
+    pub(super) fn of_topic(
+        &self,
+        topic: &TopicName,
+    ) -> impl Iterator<Item = LeaseView<'_>> + Clone {
+        self.topics.get_key_value(topic).into_iter().flat_map(|(topic, leases)| {
+            leases.iter().map(move |(key, lease)| view(topic, key, lease))
+        })
     }
 
     pub(super) fn all(&self) -> impl Iterator<Item = LeaseView<'_>> {
-        self.topics
-            .iter()
-            .flat_map(|(topic, leases)| leases.iter().map(move |(key, lease)| view(topic, key, lease)))
+        self.topics.iter().flat_map(|(topic, leases)| {
+            leases.iter().map(move |(key, lease)| view(topic, key, lease))
+        })
     }
 }
 

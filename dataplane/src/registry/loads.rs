@@ -1,7 +1,9 @@
-//! How much the flows that share the layer broker carry, and which of them have just given a topic to another.
+//! How much the flows that share the layer broker carry, and which of them have just given a topic
+//! to another.
 //!
-//! Loads come with every Hello on the channel of the layer broker. They are no part of what is announced, so they change neither
-//! version nor digest, and no topic is planned anew because of them.
+//! Loads come with every Hello on the channel of the layer broker. They are no part of what is
+//! announced, so they change neither version nor digest, and no topic is planned anew because of
+//! them.
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +13,8 @@ use blaze_proto::link::link_control::Hello;
 use super::Registry;
 use crate::world::{FlowState, Handover, Reach};
 
-/// A flow that has given or got a topic by load does neither again for this long: what it carries now is not measured yet.
+/// A flow that has given or got a topic by load does neither again for this long: what it carries
+/// now is not measured yet.
 pub const REST: Duration = Duration::from_secs(10);
 
 /// Payload bytes per second of one flow.
@@ -50,7 +53,8 @@ impl Registry {
         self.remotes.get(flow)?.ways.layer?.load
     }
 
-    /// The other flows that could be given a topic now: they share the layer broker, live and have settled.
+    /// The other flows that could be given a topic now: they share the layer broker, live and have
+    /// settled.
     pub fn settled_replicas(&self) -> impl Iterator<Item = &FlowId> {
         let others = self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me);
         // One that is not on the inter scope could not carry anything there.
@@ -78,10 +82,7 @@ impl Registry {
     pub(super) fn note_move(&mut self, now: Instant, from: &FlowId, handover: &Handover) {
         let Some(to) = &handover.to else { return };
         self.moves.retain(|_, at| now.saturating_duration_since(*at) < REST);
-        for flow in [from, to]
-            .into_iter()
-            .filter(|flow| self.world.flows.contains_key(*flow))
-        {
+        for flow in [from, to].into_iter().filter(|flow| self.world.flows.contains_key(*flow)) {
             self.moves.insert(flow.clone(), now);
         }
     }

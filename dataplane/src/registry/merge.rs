@@ -17,20 +17,14 @@ pub(super) const MAX_FILTERS: usize = 128;
 pub(super) fn merge<'a>(leases: &(impl Iterator<Item = LeaseView<'a>> + Clone)) -> TopicEntry {
     let of = |scope: Scope| {
         let of_kind = |kind| {
-            leases
-                .clone()
-                .filter(move |lease| lease.key.scope == scope && lease.key.kind == kind)
+            leases.clone().filter(move |lease| lease.key.scope == scope && lease.key.kind == kind)
         };
         ScopeEntry {
             advertise: merge_advertise(of_kind(LeaseKind::Advertise)),
             request: merge_request(of_kind(LeaseKind::Request)),
         }
     };
-    TopicEntry {
-        node: of(Scope::Node),
-        layer: of(Scope::Layer),
-        ..TopicEntry::default()
-    }
+    TopicEntry { node: of(Scope::Node), layer: of(Scope::Layer), ..TopicEntry::default() }
 }
 
 fn merge_advertise<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Option<Advertise> {
@@ -66,12 +60,7 @@ fn merge_advertise<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> O
 
 fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Option<Request> {
     let terms = leases.clone().filter_map(|lease| match lease.terms {
-        Terms::Request {
-            max_rate_hz,
-            bare,
-            from,
-            ..
-        } => Some((*max_rate_hz, *bare, from)),
+        Terms::Request { max_rate_hz, bare, from, .. } => Some((*max_rate_hz, *bare, from)),
         Terms::Advertise { .. } => None,
     });
     let quality = merge_quality(leases.clone().map(|lease| lease.quality()))?;
@@ -94,16 +83,13 @@ fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Opt
         reliability: quality.reliability,
         durability: quality.durability,
         depth: quality.depth,
-        // A request may only lower the class, so one that says nothing asks for the highest there is: as published.
+        // A request may only lower the class, so one that says nothing asks for the highest there
+        // is: as published.
         priority: leases
             .map(|lease| lease.quality().priority)
             .collect::<Option<Vec<Priority>>>()
             .and_then(|all| all.into_iter().min()),
-        from: if any_origin {
-            Vec::new()
-        } else {
-            filters.into_iter().collect()
-        },
+        from: if any_origin { Vec::new() } else { filters.into_iter().collect() },
         type_name: quality.type_name,
         type_hash: quality.type_hash,
         framed: terms.clone().any(|(_, bare, _)| !bare),
@@ -119,12 +105,9 @@ fn highest_rate(rates: impl Iterator<Item = Option<f64>>) -> Option<f64> {
 /// All but the class; `None` for no lease at all.
 fn merge_quality<'a>(all: impl Iterator<Item = &'a Quality> + Clone) -> Option<Quality> {
     let first = all.clone().next()?;
-    // Type and hash come from one lease where possible; leases come in the order of their keys, so every flow that sees
-    // the same leases takes the same one.
-    let typed = all
-        .clone()
-        .find(|quality| !quality.type_name.is_empty())
-        .unwrap_or(first);
+    // Type and hash come from one lease where possible; leases come in the order of their keys, so
+    // every flow that sees the same leases takes the same one.
+    let typed = all.clone().find(|quality| !quality.type_name.is_empty()).unwrap_or(first);
     let type_hash = if typed.type_hash.is_empty() {
         all.clone()
             .filter(|quality| quality.type_name == typed.type_name)

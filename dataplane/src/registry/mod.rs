@@ -1,12 +1,14 @@
-//! Who advertises and requests what: leases of the local services, and what other flows announce of theirs.
+//! Who advertises and requests what: leases of the local services, and what other flows announce of
+//! theirs.
 //!
 //! ```text
 //! control payload ─► LeaseTable ─merge─► own topics in the World ─► Announcer ─► Delta, Snapshot to other flows
 //! Hello, Delta, Snapshot of other flows ─► Remote ─► their topics in the World ─► planner
 //! ```
 //!
-//! No input or output and no clock: its owner passes the time, sends what [`Registry::poll`] gives, and plans the topics
-//! that each call reports as changed. Poll after every message and at [`Registry::next_poll`].
+//! No input or output and no clock: its owner passes the time, sends what [`Registry::poll`] gives,
+//! and plans the topics that each call reports as changed. Poll after every message and at
+//! [`Registry::next_poll`].
 
 mod access;
 mod announce;
@@ -30,7 +32,9 @@ mod wire;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
-use blaze_domain::control::{Answer, ControlError, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload};
+use blaze_domain::control::{
+    Answer, ControlError, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload,
+};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Durability, FlowId, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, RouteState};
@@ -52,7 +56,9 @@ use remote::Remote;
 use replicas::Hearing;
 pub use replicas::SILENT;
 pub use stored::{Restored, UnsavedLease};
-pub use types::{AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults};
+pub use types::{
+    AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults,
+};
 pub(crate) use wire::MAX_ROUTES;
 
 use crate::world::{FlowState, FlowView, Reach, ScopeEntry, World};
@@ -85,7 +91,8 @@ pub struct Registry {
     remotes: BTreeMap<FlowId, Remote>,
     /// What this flow hears of itself on the layer broker.
     hearing: Option<Hearing>,
-    /// Flows whose last life is over, and until when they may come back with the services that they had.
+    /// Flows whose last life is over, and until when they may come back with the services that they
+    /// had.
     departed: BTreeMap<FlowId, Instant>,
     world: World,
     /// What waits for [`Registry::poll`].
@@ -116,7 +123,10 @@ impl Registry {
             ..FlowView::new(config.kind, config.epoch)
         };
         Self {
-            leases: LeaseTable::new(config.max_leases.min(MAX_LEASED_ENTRIES), config.lease_stores.clone()),
+            leases: LeaseTable::new(
+                config.max_leases.min(MAX_LEASED_ENTRIES),
+                config.lease_stores.clone(),
+            ),
             names: NameBook::new(config.layer_names),
             on_layer: BTreeSet::new(),
             off: BTreeSet::new(),
@@ -252,9 +262,7 @@ impl Registry {
             ));
         }
         self.check_name(now, scope, message, &object.pointer)?;
-        let applied = self
-            .leases
-            .apply(now, scope, &self.config.me, message, &object.pointer)?;
+        let applied = self.leases.apply(now, scope, &self.config.me, message, &object.pointer)?;
         if applied.changed {
             dirty.insert(common.topic.clone());
         }
@@ -268,12 +276,11 @@ impl Registry {
             return Ok(());
         }
         let (leases, on_layer) = (&self.leases, &self.on_layer);
-        self.names.claim(topic, |other| {
-            on_layer.contains(other) || leases.has(other, Scope::Layer)
-        })
+        self.names.claim(topic, |other| on_layer.contains(other) || leases.has(other, Scope::Layer))
     }
 
-    /// A bridge of this flow is to read or write a topic on the layer scope, whether or not anybody leases it there.
+    /// A bridge of this flow is to read or write a topic on the layer scope, whether or not anybody
+    /// leases it there.
     ///
     /// # Errors
     /// [`NameFault`] where the layer broker cannot have it.
@@ -298,14 +305,11 @@ impl Registry {
         self.on_layer.remove(topic);
     }
 
-    /// A scope belongs to another flow, or no longer does. While it does it is as if it were not there, and its leases are
-    /// the other's; then they are to be read anew. Returns the topics to plan anew.
+    /// A scope belongs to another flow, or no longer does. While it does it is as if it were not
+    /// there, and its leases are the other's; then they are to be read anew. Returns the topics to
+    /// plan anew.
     pub fn set_in_use(&mut self, now: Instant, scope: Scope, in_use: bool) -> BTreeSet<TopicName> {
-        let changes = if in_use {
-            self.off.insert(scope)
-        } else {
-            self.off.remove(&scope)
-        };
+        let changes = if in_use { self.off.insert(scope) } else { self.off.remove(&scope) };
         if !changes {
             return BTreeSet::new();
         }
@@ -314,7 +318,8 @@ impl Registry {
             self.leases.give_up(scope);
         }
         let (node_scope, layer_scope) = (self.config.node_scope, self.config.layer_scope);
-        let (node_off, layer_off) = (self.off.contains(&Scope::Node), self.off.contains(&Scope::Layer));
+        let (node_off, layer_off) =
+            (self.off.contains(&Scope::Node), self.off.contains(&Scope::Layer));
         if let Some(own) = self.own_view() {
             own.node_scope = node_scope && !node_off;
             own.layer_scope = layer_scope.filter(|_| !layer_off);
@@ -330,7 +335,8 @@ impl Registry {
         self.leases.is_reading(scope)
     }
 
-    /// Whether this flow answers, of all that share the layer broker: the same one in every flow with the same view.
+    /// Whether this flow answers, of all that share the layer broker: the same one in every flow
+    /// with the same view.
     fn is_designated(&self, scope: Scope, reply_to: &ChannelName, id: Option<&str>) -> bool {
         if scope == Scope::Node || self.config.layer_scope.is_none() {
             return true;
@@ -356,7 +362,9 @@ impl Registry {
         let mut changed = BTreeSet::new();
         for topic in dirty {
             let mut merged = merge::merge(&self.leases.of_topic(&topic));
-            for (scope, entry) in [(Scope::Node, &mut merged.node), (Scope::Layer, &mut merged.layer)] {
+            for (scope, entry) in
+                [(Scope::Node, &mut merged.node), (Scope::Layer, &mut merged.layer)]
+            {
                 if self.off.contains(&scope) {
                     *entry = ScopeEntry::default();
                 }
@@ -391,11 +399,7 @@ impl Registry {
             })
             .collect();
         let changed = self.refresh(now, lapsed.iter().map(|lease| lease.topic.clone()).collect());
-        Changes {
-            events,
-            changed,
-            lapsed,
-        }
+        Changes { events, changed, lapsed }
     }
 
     /// When the next lease lapses.
@@ -404,8 +408,8 @@ impl Registry {
         self.leases.next_expiry()
     }
 
-    /// The most samples that an advertisement of the topic on that scope keeps per writer for late joiners, 0 = none; `None`
-    /// where nobody leases the topic there.
+    /// The most samples that an advertisement of the topic on that scope keeps per writer for late
+    /// joiners, 0 = none; `None` where nobody leases the topic there.
     #[must_use]
     pub fn channel_depth(&self, topic: &TopicName, scope: Scope) -> Option<u32> {
         let of_scope = self.leases.of_topic(topic).filter(|lease| lease.key.scope == scope);
@@ -434,12 +438,11 @@ impl Registry {
 
     /// The local services that advertise a topic.
     pub fn local_advertisers(&self, topic: &TopicName) -> impl Iterator<Item = LeaseView<'_>> {
-        self.leases
-            .of_topic(topic)
-            .filter(|lease| lease.key.kind == LeaseKind::Advertise)
+        self.leases.of_topic(topic).filter(|lease| lease.key.kind == LeaseKind::Advertise)
     }
 
-    /// Leases of a topic that lapsed or were refused and were not made anew, newest first, as far as remembered.
+    /// Leases of a topic that lapsed or were refused and were not made anew, newest first, as far
+    /// as remembered.
     pub fn lapsed(&self, topic: &TopicName) -> impl Iterator<Item = &LapsedLease> {
         self.leases.lapsed(topic)
     }

@@ -1,4 +1,5 @@
-//! What the layer broker makes of topic names: which it cannot express, and which two are one to it.
+//! What the layer broker makes of topic names: which it cannot express, and which two are one to
+//! it.
 
 use std::collections::HashMap;
 
@@ -10,7 +11,8 @@ const MAX_KAFKA_NAME: usize = 249;
 /// Names that are remembered before those of topics that nobody uses are forgotten.
 const FIRST_SWEEP: usize = 1024;
 
-/// Topics that somebody else's on the broker stands in the way of, at most; as many as a flow has leases.
+/// Topics that somebody else's on the broker stands in the way of, at most; as many as a flow has
+/// leases.
 const MAX_FOREIGN: usize = 10_000;
 
 /// How the layer broker names topics.
@@ -30,7 +32,9 @@ pub enum LayerNames {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NameFault {
     /// The broker has no such names.
-    #[error("has {bytes} bytes with the broker's prefix, at most {MAX_KAFKA_NAME} are possible on Kafka")]
+    #[error(
+        "has {bytes} bytes with the broker's prefix, at most {MAX_KAFKA_NAME} are possible on Kafka"
+    )]
     TooLong {
         /// Bytes that it would have.
         bytes: usize,
@@ -65,16 +69,15 @@ pub(super) struct NameBook {
 
 impl NameBook {
     pub(super) fn new(names: LayerNames) -> Self {
-        Self {
-            names,
-            holders: HashMap::new(),
-            foreign: HashMap::new(),
-            sweep_at: FIRST_SWEEP,
-        }
+        Self { names, holders: HashMap::new(), foreign: HashMap::new(), sweep_at: FIRST_SWEEP }
     }
 
     /// Takes the topic's name on the broker, unless a topic that is in use has it.
-    pub(super) fn claim(&mut self, topic: &TopicName, in_use: impl Fn(&TopicName) -> bool) -> Result<(), NameFault> {
+    pub(super) fn claim(
+        &mut self,
+        topic: &TopicName,
+        in_use: impl Fn(&TopicName) -> bool,
+    ) -> Result<(), NameFault> {
         let LayerNames::Kafka { prefix_bytes } = self.names else {
             return Ok(());
         };
@@ -87,16 +90,12 @@ impl NameBook {
         }
         let key = kafka_key(topic.as_str());
         if let Some(reserved) = reserved().into_iter().find(|name| kafka_key(name) == key) {
-            return Err(NameFault::Collision {
-                other: reserved.to_owned(),
-            });
+            return Err(NameFault::Collision { other: reserved.to_owned() });
         }
         match self.holders.get(&key) {
             Some(holder) if holder == topic => return Ok(()),
             Some(holder) if in_use(holder) => {
-                return Err(NameFault::Collision {
-                    other: holder.to_string(),
-                });
+                return Err(NameFault::Collision { other: holder.to_string() });
             }
             _ => {}
         }
@@ -168,8 +167,7 @@ mod tests {
         for other in ["imu-data", "imu/Data", "imu/data/x"] {
             book.claim(&topic(other), |_| true).unwrap();
         }
-        book.claim(&topic("imu_data"), |_| false)
-            .expect("the other is not in use any more");
+        book.claim(&topic("imu_data"), |_| false).expect("the other is not in use any more");
         assert!(book.claim(&topic("imu/data"), |_| true).is_err());
     }
 

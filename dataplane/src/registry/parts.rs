@@ -1,4 +1,5 @@
-//! Who carries what is published on a layer scope out of the layer: as it travels, and what follows when it changes.
+//! Who carries what is published on a layer scope out of the layer: as it travels, and what follows
+//! when it changes.
 //!
 //! ```text
 //! carry ─► (drain, a better one has settled, or one has less to carry) ─► handover: next_offset ─► the next one begins there
@@ -23,14 +24,15 @@ use crate::world::{Carrying, Handover, Hold, Part, Reach, TopicEntry};
 const CARRY: &str = "carry";
 /// One with this step says that it did, and where in a partition the next one begins.
 const HANDOVER: &str = "handover";
-/// Partitions whose offsets are handed over; of topics with more only the time of the last sign of life is known.
+/// Partitions whose offsets are handed over; of topics with more only the time of the last sign of
+/// life is known.
 pub(crate) const MAX_PARTITIONS: usize = MAX_ROUTES / 2;
 /// What a flow has left behind is taken up within this time: later it would be old.
 pub const LEGACY: Duration = Duration::from_secs(10);
 /// How much before the last sign of life of a flow that has died the next one begins.
 const BEFORE_LAST_SIGN_MS: i64 = 1000;
-/// How much before the last sign of life of a flow that lives, but has lost its way out, the next one begins: as much more as it takes
-/// to notice that on the inter scope.
+/// How much before the last sign of life of a flow that lives, but has lost its way out, the next
+/// one begins: as much more as it takes to notice that on the inter scope.
 const BEFORE_LOST_WAY_MS: i64 = BEFORE_LAST_SIGN_MS + 2500;
 
 /// Where another flow of the group stopped.
@@ -59,9 +61,7 @@ pub(crate) fn carrying_states(me: &FlowId, carrying: &Carrying) -> Vec<RouteStat
         Carrying::HandedOver(Handover { offsets, to }) => {
             let to = to.as_ref().unwrap_or(me);
             let offsets = offsets.iter().take(MAX_PARTITIONS);
-            offsets
-                .map(|offset| state(HANDOVER, to, u64::try_from(*offset).unwrap_or(0)))
-                .collect()
+            offsets.map(|offset| state(HANDOVER, to, u64::try_from(*offset).unwrap_or(0))).collect()
         }
     }
 }
@@ -69,9 +69,8 @@ pub(crate) fn carrying_states(me: &FlowId, carrying: &Carrying) -> Vec<RouteStat
 /// The part of a flow in a topic, as its route states tell; of its receivers those of one layer.
 pub(super) fn part_of(flow: &FlowId, routes: &[RouteState], layer: &str) -> Part {
     let handed = || routes.iter().filter(|route| route.step == HANDOVER);
-    let offsets: Arc<[i64]> = handed()
-        .map(|route| i64::try_from(route.next_offset).unwrap_or(i64::MAX))
-        .collect();
+    let offsets: Arc<[i64]> =
+        handed().map(|route| i64::try_from(route.next_offset).unwrap_or(i64::MAX)).collect();
     let to = handed().next().and_then(|route| route.receiver.parse::<FlowId>().ok());
     let carrying = if routes.iter().any(|route| route.step == CARRY) {
         Carrying::Carries
@@ -97,8 +96,9 @@ pub(super) fn part_of(flow: &FlowId, routes: &[RouteState], layer: &str) -> Part
 }
 
 impl Registry {
-    /// Where this flow begins with what it is to carry out of the layer from now on: where the flow before it has stopped, if
-    /// there was one lately. After a crash only `reliable` topics are begun in the past.
+    /// Where this flow begins with what it is to carry out of the layer from now on: where the flow
+    /// before it has stopped, if there was one lately. After a crash only `reliable` topics are
+    /// begun in the past.
     pub fn begin_carrying(&mut self, now: Instant, topic: &TopicName, reliable: bool) -> Begin {
         let Some(legacy) = self.legacies.remove(topic) else {
             return Begin::Now;
@@ -115,7 +115,8 @@ impl Registry {
     #[must_use]
     pub fn is_carried_elsewhere(&self, topic: &TopicName) -> bool {
         let others = self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me);
-        let mut living = others.filter(|(flow, view)| view.reach != Reach::Down && self.shares_layer(flow));
+        let mut living =
+            others.filter(|(flow, view)| view.reach != Reach::Down && self.shares_layer(flow));
         living.any(|(flow, _)| self.carrying(flow, topic) == Some(&Carrying::Carries))
     }
 
@@ -128,7 +129,9 @@ impl Registry {
     pub(super) fn shares_layer(&self, flow: &FlowId) -> bool {
         let own = self.world.own().and_then(|own| own.layer_scope);
         let view = self.world.flows.get(flow);
-        flow.layer == self.config.me.layer && own.is_some() && view.is_some_and(|view| view.layer_scope == own)
+        flow.layer == self.config.me.layer
+            && own.is_some()
+            && view.is_some_and(|view| view.layer_scope == own)
     }
 
     fn part(&self, flow: &FlowId, topic: &TopicName) -> Option<&Part> {
@@ -149,17 +152,15 @@ impl Registry {
     /// Whether the own flow keeps a topic that it carries.
     #[must_use]
     pub fn hold(&self, topic: &TopicName) -> &Hold {
-        self.part(&self.config.me, topic)
-            .map_or(&Hold::Hashing, |part| &part.hold)
+        self.part(&self.config.me, topic).map_or(&Hold::Hashing, |part| &part.hold)
     }
 
     /// A flow of the group has given this one the topic by name.
     #[must_use]
     pub fn was_given(&self, topic: &TopicName) -> bool {
         let others = self.world.flows.keys().filter(|flow| **flow != self.config.me);
-        let mut given = others
-            .filter(|flow| self.shares_layer(flow))
-            .map(|flow| self.carrying(flow, topic));
+        let mut given =
+            others.filter(|flow| self.shares_layer(flow)).map(|flow| self.carrying(flow, topic));
         given.any(|carrying| match carrying {
             Some(Carrying::HandedOver(handover)) => handover.to.as_ref() == Some(&self.config.me),
             _ => false,
@@ -211,16 +212,21 @@ impl Registry {
                     Carrying::No => self.take_up_lost(now, flow, &topic),
                 }
                 self.urgent.insert(topic.clone());
-            } else if !shares && self.legacies.contains_key(&topic) && !self.is_asked_outside(&topic) {
-                // What is left behind is for those who asked all the while. Few topics are, and looking for them takes all flows.
+            } else if !shares
+                && self.legacies.contains_key(&topic)
+                && !self.is_asked_outside(&topic)
+            {
+                // What is left behind is for those who asked all the while. Few topics are, and
+                // looking for them takes all flows.
                 self.legacies.remove(&topic);
             }
             self.put_part(flow, &topic, part);
         }
     }
 
-    /// A flow of the group does not carry a topic any more and has handed it to nobody, though somebody elsewhere asks for it whom this
-    /// flow reaches: that one has lost its way to them. What it sent since is lost.
+    /// A flow of the group does not carry a topic any more and has handed it to nobody, though
+    /// somebody elsewhere asks for it whom this flow reaches: that one has lost its way to them.
+    /// What it sent since is lost.
     fn take_up_lost(&mut self, now: Instant, flow: &FlowId, topic: &TopicName) {
         let carried = self.carrying(flow, topic) == Some(&Carrying::Carries);
         let sign = self.remotes.get(flow).and_then(Remote::last_read_ms);
@@ -236,7 +242,8 @@ impl Registry {
     /// Whether a flow of another group that can be reached asks for the topic.
     fn is_asked_outside(&self, topic: &TopicName) -> bool {
         let others = self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me);
-        let mut outside = others.filter(|(flow, view)| view.reach != Reach::Down && !self.shares_layer(flow));
+        let mut outside =
+            others.filter(|(flow, view)| view.reach != Reach::Down && !self.shares_layer(flow));
         outside.any(|(_, view)| view.topics.get(topic).is_some_and(TopicEntry::is_requested))
     }
 
@@ -251,7 +258,8 @@ impl Registry {
         }
     }
 
-    /// A flow of the group has gone without a word: what it carried begins a second before its last sign of life.
+    /// A flow of the group has gone without a word: what it carried begins a second before its last
+    /// sign of life.
     pub(super) fn inherit(&mut self, now: Instant, flow: &FlowId) {
         let Some(view) = self.world.flows.get(flow).filter(|_| self.shares_layer(flow)) else {
             return;
@@ -276,8 +284,7 @@ impl Registry {
             return;
         }
         if self.legacies.len() >= MAX_ENTRIES {
-            self.legacies
-                .retain(|_, legacy| now.saturating_duration_since(legacy.at) < LEGACY);
+            self.legacies.retain(|_, legacy| now.saturating_duration_since(legacy.at) < LEGACY);
         }
         if self.legacies.len() < MAX_ENTRIES {
             self.legacies.insert(topic.clone(), Legacy { begin, at: now });

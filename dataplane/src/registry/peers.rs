@@ -16,15 +16,18 @@ use crate::world::{FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Role}
 
 /// Most other flows that are followed.
 pub const MAX_FLOWS: usize = 1280;
-/// How long after its last sign of life a flow may come back with the services that it had: they are not gone because it is.
+/// How long after its last sign of life a flow may come back with the services that it had: they
+/// are not gone because it is.
 const RETURNS: Duration = Duration::from_secs(60);
 /// Snapshots that are pulled at a time, so that their unfinished parts stay few.
 const MAX_PULLS: usize = 8;
-/// Messages to other flows that wait for [`Registry::poll`]; snapshot parts beyond it are asked for again.
+/// Messages to other flows that wait for [`Registry::poll`]; snapshot parts beyond it are asked for
+/// again.
 const MAX_OUTGOING: usize = 2048;
 
 impl Registry {
-    /// Version and digest of what flows of other groups are told, for the own Hello on the inter scope.
+    /// Version and digest of what flows of other groups are told, for the own Hello on the inter
+    /// scope.
     #[must_use]
     pub fn announced(&self) -> (u64, u64) {
         self.announcer.announced()
@@ -41,9 +44,17 @@ impl Registry {
     }
 
     /// Another flow said Hello somewhere. Returns the topics to plan anew.
-    pub(super) fn hear(&mut self, now: Instant, from: &FlowId, hello: &Hello, way: Way) -> BTreeSet<TopicName> {
+    pub(super) fn hear(
+        &mut self,
+        now: Instant,
+        from: &FlowId,
+        hello: &Hello,
+        way: Way,
+    ) -> BTreeSet<TopicName> {
         let Some(kind) = kind_from_wire(hello.kind()).filter(|_| {
-            *from != self.config.me && from.layer.as_str() == hello.layer && from.node.as_str() == hello.node
+            *from != self.config.me
+                && from.layer.as_str() == hello.layer
+                && from.node.as_str() == hello.node
         }) else {
             self.faults.bad_hellos += 1;
             return BTreeSet::new();
@@ -55,13 +66,14 @@ impl Registry {
         };
         let layer_scope = (hello.layer_scope_id != 0).then_some(LayerScopeId(hello.layer_scope_id));
         let mut changed = BTreeSet::new();
-        // Of a flow that shares the layer broker counts what it says there: on the inter scope it speaks to others, and under
-        // lives of their own.
+        // Of a flow that shares the layer broker counts what it says there: on the inter scope it
+        // speaks to others, and under lives of their own.
         if way == Way::Link && self.is_heard_on_layer(from) {
             if !self.has_left_layer(from, layer_scope) {
                 return changed;
             }
-            // It has another layer broker now, or none: from now on the inter scope is the only way to it.
+            // It has another layer broker now, or none: from now on the inter scope is the only way
+            // to it.
             changed = self.forget(now, from);
         }
         match self.world.flows.get(from).map(|view| view.epoch) {
@@ -95,14 +107,7 @@ impl Registry {
         let said = (kind, state, layer_scope, gateway, role, hello.layer_away);
         let (scope, away) = (view.layer_scope, view.layer_away);
         let same = !is_new && (view.kind, view.state, scope, view.gateway, view.role, away) == said;
-        (
-            view.kind,
-            view.state,
-            view.layer_scope,
-            view.gateway,
-            view.role,
-            view.layer_away,
-        ) = said;
+        (view.kind, view.state, view.layer_scope, view.gateway, view.role, view.layer_away) = said;
         let remote = self.remotes.entry(from.clone()).or_default();
         if way == Way::Layer {
             remote.link_peers = hello.link_peers;
@@ -114,7 +119,8 @@ impl Registry {
         remote.on_hello(now, hello.registry_version, hello.registry_digest, wait);
         if !same {
             self.tell_of(now, from);
-            // Which flow receives, reads or answers hangs on all live flows, whatever their own topics are.
+            // Which flow receives, reads or answers hangs on all live flows, whatever their own
+            // topics are.
             changed.extend(self.all_topics());
         }
         changed
@@ -134,8 +140,8 @@ impl Registry {
         }
     }
 
-    /// Another flow sent a Delta, a SnapshotRequest or a Snapshot; other bodies are not the registry's. Returns the
-    /// topics to plan anew.
+    /// Another flow sent a Delta, a SnapshotRequest or a Snapshot; other bodies are not the
+    /// registry's. Returns the topics to plan anew.
     pub fn on_control(&mut self, now: Instant, from: &FlowId, body: Body) -> BTreeSet<TopicName> {
         let answers = matches!(body, Body::SnapshotRequest(_));
         if !answers && self.is_heard_on_layer(from) {
@@ -145,14 +151,24 @@ impl Registry {
     }
 
     /// The same, wherever it was heard.
-    pub(super) fn take(&mut self, now: Instant, from: &FlowId, body: Body, way: Way) -> BTreeSet<TopicName> {
-        let (Some(remote), Some(view)) = (self.remotes.get_mut(from), self.world.flows.get_mut(from)) else {
+    pub(super) fn take(
+        &mut self,
+        now: Instant,
+        from: &FlowId,
+        body: Body,
+        way: Way,
+    ) -> BTreeSet<TopicName> {
+        let (Some(remote), Some(view)) =
+            (self.remotes.get_mut(from), self.world.flows.get_mut(from))
+        else {
             self.faults.unknown_flows += 1;
             return BTreeSet::new();
         };
         let changed = match body {
             Body::Delta(delta) => remote.on_delta(now, delta, &mut view.topics, &mut self.faults),
-            Body::Snapshot(snapshot) => remote.on_snapshot(now, snapshot, &mut view.topics, &mut self.faults),
+            Body::Snapshot(snapshot) => {
+                remote.on_snapshot(now, snapshot, &mut view.topics, &mut self.faults)
+            }
             Body::SnapshotRequest(request) => {
                 // On the channel of the layer broker all hear the answer.
                 let (to, mut parts) = match way {
@@ -169,7 +185,11 @@ impl Registry {
                 }
                 return BTreeSet::new();
             }
-            Body::Hello(_) | Body::Feedback(_) | Body::Goodbye(_) | Body::WrittenRequest(_) | Body::Written(_) => {
+            Body::Hello(_)
+            | Body::Feedback(_)
+            | Body::Goodbye(_)
+            | Body::WrittenRequest(_)
+            | Body::Written(_) => {
                 return BTreeSet::new();
             }
         };
@@ -192,8 +212,8 @@ impl Registry {
         self.update_reach(now, flow)
     }
 
-    /// The link does not wait for another flow any more. One that is heard on the layer broker stays. Returns the topics to
-    /// plan anew.
+    /// The link does not wait for another flow any more. One that is heard on the layer broker
+    /// stays. Returns the topics to plan anew.
     pub fn forget_link(&mut self, now: Instant, flow: &FlowId) -> BTreeSet<TopicName> {
         let ways = self.remotes.get(flow).map(|remote| remote.ways);
         if ways.is_some_and(|ways| ways.over_layer()) {
@@ -233,8 +253,9 @@ impl Registry {
         topics
     }
 
-    /// Whether a service that nobody names may be named again in a moment: the flow of its node has ended, or that of a layer in which no
-    /// other could name it, and has not been there again for long enough to have told of its services.
+    /// Whether a service that nobody names may be named again in a moment: the flow of its node has
+    /// ended, or that of a layer in which no other could name it, and has not been there again for
+    /// long enough to have told of its services.
     pub(crate) fn may_return(&self, now: Instant, of: &OriginFilter) -> bool {
         let settled = |flow: &FlowId| self.world.flows.get(flow).is_some_and(|view| view.settled);
         self.departed.iter().any(|(flow, until)| {
@@ -248,7 +269,8 @@ impl Registry {
         })
     }
 
-    /// What is to be sent to other flows now; each encodes to at most [`MAX_LINK_CONTROL_BYTES`](super::MAX_LINK_CONTROL_BYTES).
+    /// What is to be sent to other flows now; each encodes to at most
+    /// [`MAX_LINK_CONTROL_BYTES`](super::MAX_LINK_CONTROL_BYTES).
     pub fn poll(&mut self, now: Instant) -> Vec<(FlowId, Body)> {
         let mut messages = Vec::new();
         let mut layer = Vec::new();
@@ -260,7 +282,8 @@ impl Registry {
         }
         self.see_whom_it_speaks_for(now);
         let (deltas, layer_deltas) = self.announce(now);
-        // Those who share the layer broker hear of it there whatever becomes of the link: what is handed over must arrive.
+        // Those who share the layer broker hear of it there whatever becomes of the link: what is
+        // handed over must arrive.
         let over_link = |remote: &Remote| remote.ways.over_link() && !remote.ways.over_layer();
         for (flow, _) in self.remotes.iter().filter(|(_, remote)| over_link(remote)) {
             messages.extend(deltas.iter().map(|delta| (flow.clone(), Body::Delta(delta.clone()))));
@@ -268,7 +291,8 @@ impl Registry {
         if self.remotes.values().any(|remote| remote.ways.over_layer()) {
             layer.extend(layer_deltas.into_iter().map(|delta| (None, Body::Delta(delta))));
         }
-        // First the pulls that go on: one that is given up makes room for another. Then those that waited longest.
+        // First the pulls that go on: one that is given up makes room for another. Then those that
+        // waited longest.
         let mut order: Vec<(bool, Instant, FlowId)> = self
             .remotes
             .iter()
@@ -281,10 +305,8 @@ impl Registry {
         order.sort_unstable();
         for (_, _, flow) in order {
             let may_start = self.pulls() < MAX_PULLS;
-            let request = self
-                .remotes
-                .get_mut(&flow)
-                .and_then(|remote| remote.poll(now, may_start));
+            let request =
+                self.remotes.get_mut(&flow).and_then(|remote| remote.poll(now, may_start));
             let Some(request) = request.map(Body::SnapshotRequest) else {
                 continue;
             };
@@ -321,37 +343,35 @@ impl Registry {
             .min()
     }
 
-    /// What other flows told of a topic, by flow and scope. The layer scope of a flow that shares the own layer broker
-    /// is left out: those services hold leases here. What a gateway tells of flows of other groups is of its inter scope.
-    pub fn remote_leases<'a>(&'a self, topic: &'a TopicName) -> impl Iterator<Item = RemoteLease<'a>> {
+    /// What other flows told of a topic, by flow and scope. The layer scope of a flow that shares
+    /// the own layer broker is left out: those services hold leases here. What a gateway tells of
+    /// flows of other groups is of its inter scope.
+    pub fn remote_leases<'a>(
+        &'a self,
+        topic: &'a TopicName,
+    ) -> impl Iterator<Item = RemoteLease<'a>> {
         let shares = |flow: &FlowId, view: &FlowView| {
             flow.layer == self.config.me.layer
                 && self.config.layer_scope.is_some()
                 && view.layer_scope == self.config.layer_scope
         };
-        self.world
-            .flows
-            .iter()
-            .filter(|(flow, _)| **flow != self.config.me)
-            .flat_map(move |(flow, view)| {
+        self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me).flat_map(
+            move |(flow, view)| {
                 let entry = view.topics.get(topic);
                 let node = entry.map(|entry| (Scope::Node, &entry.node));
-                let layer = entry
-                    .filter(|_| !shares(flow, view))
-                    .map(|entry| (Scope::Layer, &entry.layer));
+                let layer =
+                    entry.filter(|_| !shares(flow, view)).map(|entry| (Scope::Layer, &entry.layer));
                 let outside = entry.map(|entry| (Scope::Inter, &entry.outside));
-                node.into_iter()
-                    .chain(layer)
-                    .chain(outside)
-                    .filter_map(move |(scope, entry)| {
-                        (entry.advertise.is_some() || entry.request.is_some()).then_some(RemoteLease {
-                            flow,
-                            scope,
-                            advertise: entry.advertise.as_ref(),
-                            request: entry.request.as_ref(),
-                        })
+                node.into_iter().chain(layer).chain(outside).filter_map(move |(scope, entry)| {
+                    (entry.advertise.is_some() || entry.request.is_some()).then_some(RemoteLease {
+                        flow,
+                        scope,
+                        advertise: entry.advertise.as_ref(),
+                        request: entry.request.as_ref(),
                     })
-            })
+                })
+            },
+        )
     }
 
     /// What another flow's routes of a topic do, as it told.

@@ -1,7 +1,8 @@
 //! Entries cut into pieces that fit a datagram, and the digest.
 //!
-//! An entry that does not fit one datagram travels as several with the same topic; they are joined when all parts of
-//! their Delta or Snapshot are there. The digest is taken over whole entries, so both sides compute the same.
+//! An entry that does not fit one datagram travels as several with the same topic; they are joined
+//! when all parts of their Delta or Snapshot are there. The digest is taken over whole entries, so
+//! both sides compute the same.
 
 use std::collections::BTreeMap;
 
@@ -39,10 +40,7 @@ pub(super) fn pieces(entry: wire::Entry) -> Vec<wire::Entry> {
 /// The smallest parts of an entry that [`absorb`] joins again, in order.
 fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
     let with = |fill: &dyn Fn(&mut wire::Entry)| {
-        let mut atom = wire::Entry {
-            topic: entry.topic.clone(),
-            ..wire::Entry::default()
-        };
+        let mut atom = wire::Entry { topic: entry.topic.clone(), ..wire::Entry::default() };
         fill(&mut atom);
         atom
     };
@@ -51,15 +49,13 @@ fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
         with(&|atom| atom.layer_advertise.clone_from(&entry.layer_advertise)),
         with(&|atom| atom.outside_advertise.clone_from(&entry.outside_advertise)),
     ];
-    let mut request = |request: Option<&wire::Request>, place: fn(&mut wire::Entry, wire::Request)| {
+    let mut request = |request: Option<&wire::Request>,
+                       place: fn(&mut wire::Entry, wire::Request)| {
         let Some(mut request) = request.cloned() else { return };
         let filters = std::mem::take(&mut request.from);
         atoms.push(with(&|atom| place(atom, request.clone())));
         atoms.extend(filters.into_iter().map(|filter| {
-            let more = wire::Request {
-                from: vec![filter],
-                ..wire::Request::default()
-            };
+            let more = wire::Request { from: vec![filter], ..wire::Request::default() };
             with(&|atom| place(atom, more.clone()))
         }));
     };
@@ -77,7 +73,8 @@ fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
     atoms
 }
 
-/// Adds a piece to the pieces before it. The first piece of a request holds all but its further filters.
+/// Adds a piece to the pieces before it. The first piece of a request holds all but its further
+/// filters.
 fn absorb(into: &mut wire::Entry, piece: wire::Entry) {
     fn request(into: &mut Option<wire::Request>, piece: Option<wire::Request>) {
         match (into, piece) {
@@ -129,7 +126,8 @@ pub(super) fn pack(pieces: impl IntoIterator<Item = wire::Entry>) -> Vec<Vec<wir
     parts
 }
 
-/// Hash of one whole entry. The digest of a flow is the wrapping sum over its entries, so their order does not matter.
+/// Hash of one whole entry. The digest of a flow is the wrapping sum over its entries, so their
+/// order does not matter.
 pub(crate) fn entry_hash(entry: &wire::Entry) -> u64 {
     text_hash(&entry.encode_to_vec())
 }

@@ -34,10 +34,7 @@ impl Pull {
 
     /// A pull of what another flow has asked for; what does not come is asked for later.
     pub(super) fn overheard(now: Instant, retry: Duration) -> Self {
-        Self {
-            next_request: now + retry,
-            ..Self::new(now)
-        }
+        Self { next_request: now + retry, ..Self::new(now) }
     }
 
     /// Whether all parts came.
@@ -62,9 +59,7 @@ impl Pull {
         if self.parts.len() != count || !self.asked.remove(&snapshot.part) {
             return false;
         }
-        let slot = usize::try_from(snapshot.part)
-            .ok()
-            .and_then(|part| self.parts.get_mut(part));
+        let slot = usize::try_from(snapshot.part).ok().and_then(|part| self.parts.get_mut(part));
         if let Some(slot @ None) = slot {
             *slot = Some(snapshot.entries);
             self.missing -= 1;
@@ -79,10 +74,8 @@ impl Pull {
     /// Asks for what was asked for and did not come, filled up with the next parts.
     pub(super) fn request(&mut self, now: Instant, retry: Duration) -> wire::SnapshotRequest {
         if self.version.is_some() {
-            let next = (0..)
-                .zip(&self.parts)
-                .filter(|(_, part)| part.is_none())
-                .map(|(index, _)| index);
+            let next =
+                (0..).zip(&self.parts).filter(|(_, part)| part.is_none()).map(|(index, _)| index);
             self.asked = next.take(MAX_ASKED_PARTS).collect();
         }
         self.tries += 1;

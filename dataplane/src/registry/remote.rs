@@ -78,7 +78,8 @@ pub(super) struct Remote {
     pub(super) new_gateway: Option<Instant>,
     /// Since when it cannot be reached.
     pub(super) down_since: Option<Instant>,
-    /// Flows of other groups that it reaches over the inter scope, as it says on the channel of the layer broker.
+    /// Flows of other groups that it reaches over the inter scope, as it says on the channel of the
+    /// layer broker.
     pub(super) link_peers: u32,
 }
 
@@ -87,7 +88,8 @@ pub(super) type Topics = BTreeMap<TopicName, TopicEntry>;
 
 impl Remote {
     pub(super) fn set_round_trip(&mut self, round_trip: Duration) {
-        self.retry = Some((round_trip * 2).clamp(Duration::from_millis(50), Duration::from_secs(2)));
+        self.retry =
+            Some((round_trip * 2).clamp(Duration::from_millis(50), Duration::from_secs(2)));
     }
 
     pub(super) fn routes(&self, topic: &TopicName) -> &[wire::RouteState] {
@@ -95,17 +97,15 @@ impl Remote {
     }
 
     pub(super) fn topics_with_routes(&self) -> impl Iterator<Item = &TopicName> {
-        self.entries
-            .iter()
-            .filter(|(_, entry)| !entry.routes.is_empty())
-            .map(|(topic, _)| topic)
+        self.entries.iter().filter(|(_, entry)| !entry.routes.is_empty()).map(|(topic, _)| topic)
     }
 
     pub(super) fn is_in_step(&self) -> bool {
         (self.version, self.digest) == self.heard && !self.doubt
     }
 
-    /// Until when it had read what is published on the layer broker, as its last sign of life says, by the server's clock.
+    /// Until when it had read what is published on the layer broker, as its last sign of life says,
+    /// by the server's clock.
     pub(super) fn last_read_ms(&self) -> Option<i64> {
         self.ways.layer?.read_ms
     }
@@ -120,9 +120,15 @@ impl Remote {
         self.pull_at = None;
     }
 
-    /// The flow told which version it has announced. What is to be pulled is not asked for within the time that `patience`
-    /// gives, which costs something to reckon.
-    pub(super) fn on_hello(&mut self, now: Instant, version: u64, digest: u64, patience: impl FnOnce() -> Duration) {
+    /// The flow told which version it has announced. What is to be pulled is not asked for within
+    /// the time that `patience` gives, which costs something to reckon.
+    pub(super) fn on_hello(
+        &mut self,
+        now: Instant,
+        version: u64,
+        digest: u64,
+        patience: impl FnOnce() -> Duration,
+    ) {
         if version < self.version {
             // A late Hello, unless the next ones say so too.
             self.older_hellos += 1;
@@ -173,20 +179,25 @@ impl Remote {
         faults: &mut SyncFaults,
     ) -> BTreeSet<TopicName> {
         let (from, to) = (delta.from_version, delta.to_version);
-        let (Ok(part), Ok(parts)) = (usize::try_from(delta.part), usize::try_from(delta.parts)) else {
+        let (Ok(part), Ok(parts)) = (usize::try_from(delta.part), usize::try_from(delta.parts))
+        else {
             return BTreeSet::new();
         };
-        if from >= to || delta.parts > MAX_DELTA_PARTS || part >= parts || delta.entries.len() > MAX_PART_ENTRIES {
+        if from >= to
+            || delta.parts > MAX_DELTA_PARTS
+            || part >= parts
+            || delta.entries.len() > MAX_PART_ENTRIES
+        {
             faults.bad_parts += 1;
             return BTreeSet::new();
         }
         if to <= self.version && self.pull.is_none() {
             return BTreeSet::new();
         }
-        let pending = self.pending.entry((to, from)).or_insert_with(|| PartialDelta {
-            parts: vec![None; parts],
-            missing: parts,
-        });
+        let pending = self
+            .pending
+            .entry((to, from))
+            .or_insert_with(|| PartialDelta { parts: vec![None; parts], missing: parts });
         if pending.parts.len() != parts {
             faults.bad_parts += 1;
         } else if let Some(slot @ None) = pending.parts.get_mut(part) {
@@ -201,7 +212,12 @@ impl Remote {
     }
 
     /// Applies every Delta that follows from the held version.
-    fn advance(&mut self, now: Instant, topics: &mut Topics, faults: &mut SyncFaults) -> BTreeSet<TopicName> {
+    fn advance(
+        &mut self,
+        now: Instant,
+        topics: &mut Topics,
+        faults: &mut SyncFaults,
+    ) -> BTreeSet<TopicName> {
         let mut changed = BTreeSet::new();
         while !self.doubt {
             let version = self.version;
@@ -210,7 +226,8 @@ impl Remote {
             let next = newest_first.find(|(key, delta)| follows(**key) && delta.missing == 0);
             let Some(key) = next.map(|(key, _)| *key) else { break };
             let delta = if self.pull.is_some() {
-                // The snapshot that is being pulled may be older than this: then it is needed once more.
+                // The snapshot that is being pulled may be older than this: then it is needed once
+                // more.
                 self.pending.get(&key).map(|delta| delta.parts.clone())
             } else {
                 self.pending.remove(&key).map(|delta| delta.parts)
@@ -247,7 +264,8 @@ impl Remote {
         faults: &mut SyncFaults,
     ) -> BTreeSet<TopicName> {
         if self.pull.is_none() && self.pull_at.is_some() {
-            // Somebody else has asked for what this one was about to ask for, and all hear the answer.
+            // Somebody else has asked for what this one was about to ask for, and all hear the
+            // answer.
             self.pull_at = None;
             self.pull = Some(Pull::overheard(now, self.retry.unwrap_or(DEFAULT_RETRY)));
         }
@@ -279,13 +297,7 @@ impl Remote {
         faults: &mut SyncFaults,
     ) -> BTreeSet<TopicName> {
         let mut changed = BTreeSet::new();
-        self.apply(
-            pull.parts.into_iter().flatten().flatten(),
-            true,
-            topics,
-            faults,
-            &mut changed,
-        );
+        self.apply(pull.parts.into_iter().flatten().flatten(), true, topics, faults, &mut changed);
         self.version = pull.version.unwrap_or(0);
         self.pull_at = None;
         self.older_hellos = 0;
@@ -307,13 +319,11 @@ impl Remote {
         faults: &mut SyncFaults,
         changed: &mut BTreeSet<TopicName>,
     ) {
-        let mut gone: BTreeSet<TopicName> = if replace {
-            self.entries.keys().cloned().collect()
-        } else {
-            BTreeSet::new()
-        };
+        let mut gone: BTreeSet<TopicName> =
+            if replace { self.entries.keys().cloned().collect() } else { BTreeSet::new() };
         // What goes makes room for what comes.
-        let (removed, told): (Vec<_>, Vec<_>) = join(pieces).into_values().partition(|entry| entry.removed);
+        let (removed, told): (Vec<_>, Vec<_>) =
+            join(pieces).into_values().partition(|entry| entry.removed);
         for entry in removed {
             match entry.topic.parse() {
                 Ok(topic) if self.entries.contains_key(&topic) => {
@@ -329,20 +339,16 @@ impl Remote {
                 continue;
             };
             gone.remove(&topic);
-            if !self.entries.contains_key(&topic) && self.entries.len() >= MAX_ENTRIES + gone.len() {
+            if !self.entries.contains_key(&topic) && self.entries.len() >= MAX_ENTRIES + gone.len()
+            {
                 faults.too_many_entries += 1;
                 continue;
             }
             let hash = entry_hash(&entry);
-            let new = RemoteEntry {
-                hash,
-                routes: entry.route_state,
-            };
+            let new = RemoteEntry { hash, routes: entry.route_state };
             let old = self.entries.insert(topic.clone(), new);
-            self.digest = self
-                .digest
-                .wrapping_add(hash)
-                .wrapping_sub(old.as_ref().map_or(0, |old| old.hash));
+            self.digest =
+                self.digest.wrapping_add(hash).wrapping_sub(old.as_ref().map_or(0, |old| old.hash));
             if merged.is_empty() {
                 topics.remove(&topic);
             } else {

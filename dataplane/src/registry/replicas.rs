@@ -1,8 +1,9 @@
-//! Flows of the own layer on the channel that they share on their layer broker, with or without an inter scope between them.
+//! Flows of the own layer on the channel that they share on their layer broker, with or without an
+//! inter scope between them.
 //!
-//! A flow that was ever heard there lives as long as it is heard there: whoever has lost the broker cannot carry its topics,
-//! whatever the inter scope says, and what it says there is what counts, with or without a link. Deltas are broadcast, requests
-//! and snapshots name whom they are for.
+//! A flow that was ever heard there lives as long as it is heard there: whoever has lost the broker
+//! cannot carry its topics, whatever the inter scope says, and what it says there is what counts,
+//! with or without a link. Deltas are broadcast, requests and snapshots name whom they are for.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -19,7 +20,8 @@ use crate::world::{FlowState, Reach, SETTLED_AFTER};
 pub const SILENT: Duration = Duration::from_millis(2500);
 /// A flow that does not hear its own Hellos for this long, two of them, hears nobody.
 const DEAF: Duration = Duration::from_millis(1200);
-/// Who stood still for longer before it went silent is taken up from so much before its last sign of life at most, in milliseconds.
+/// Who stood still for longer before it went silent is taken up from so much before its last sign
+/// of life at most, in milliseconds.
 const LONGEST_DEAF_MS: i64 = 30_000;
 /// One that is heard nowhere is forgotten after this long.
 const FORGET: Duration = Duration::from_secs(60);
@@ -28,7 +30,8 @@ const FORGET: Duration = Duration::from_secs(60);
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sign {
     pub(super) at: Instant,
-    /// Until when it had read what is published on the server, by that one's clock; its own Hello, where it does not say so.
+    /// Until when it had read what is published on the server, by that one's clock; its own Hello,
+    /// where it does not say so.
     pub(super) read_ms: Option<i64>,
     /// It is too old, or was the last on purpose.
     pub(super) over: bool,
@@ -64,8 +67,8 @@ impl Ways {
     }
 }
 
-/// Until when the sender of a Hello has read what is published, given when the server took it and what it says itself. It may stand still
-/// although what it writes gets through.
+/// Until when the sender of a Hello has read what is published, given when the server took it and
+/// what it says itself. It may stand still although what it writes gets through.
 fn read_until(appended_ms: i64, heard_ms: i64) -> i64 {
     if heard_ms > 0 {
         heard_ms.clamp(appended_ms.saturating_sub(LONGEST_DEAF_MS), appended_ms)
@@ -99,9 +102,8 @@ impl Hearing {
 impl Registry {
     /// The own Hello came back; the server took it at `appended_ms` of its clock.
     pub fn on_own_hello(&mut self, now: Instant, appended_ms: Option<i64>) {
-        let before = self
-            .hearing
-            .filter(|hearing| now.saturating_duration_since(hearing.last) < DEAF);
+        let before =
+            self.hearing.filter(|hearing| now.saturating_duration_since(hearing.last) < DEAF);
         self.hearing = Some(Hearing {
             since: before.map_or(now, |hearing| hearing.since),
             last: now,
@@ -109,14 +111,15 @@ impl Registry {
         });
     }
 
-    /// Until when this flow has read what is published on the layer broker, by the server's clock in milliseconds; 0 = not known.
+    /// Until when this flow has read what is published on the layer broker, by the server's clock
+    /// in milliseconds; 0 = not known.
     #[must_use]
     pub fn heard_ms(&self) -> i64 {
         self.hearing.and_then(|hearing| hearing.appended_ms).unwrap_or(0)
     }
 
-    /// A flow that shares the layer broker said Hello there, and the life that its process `began` with; the server took that at
-    /// `appended_ms` of its clock. Returns the topics to plan anew.
+    /// A flow that shares the layer broker said Hello there, and the life that its process `began`
+    /// with; the server took that at `appended_ms` of its clock. Returns the topics to plan anew.
     pub fn on_layer_hello(
         &mut self,
         now: Instant,
@@ -126,7 +129,8 @@ impl Registry {
         appended_ms: Option<i64>,
     ) -> BTreeSet<TopicName> {
         let own = self.world.own().and_then(|own| own.layer_scope);
-        if from.layer != self.config.me.layer || own.is_none_or(|own| own.0 != hello.layer_scope_id) {
+        if from.layer != self.config.me.layer || own.is_none_or(|own| own.0 != hello.layer_scope_id)
+        {
             return BTreeSet::new();
         }
         self.follow_life(from, hello.epoch, began);
@@ -148,14 +152,23 @@ impl Registry {
         changed
     }
 
-    /// A flow that shares the layer broker sent something else there. Returns the topics to plan anew.
-    pub fn on_layer_control(&mut self, now: Instant, from: &FlowId, epoch: u64, body: Body) -> BTreeSet<TopicName> {
+    /// A flow that shares the layer broker sent something else there. Returns the topics to plan
+    /// anew.
+    pub fn on_layer_control(
+        &mut self,
+        now: Instant,
+        from: &FlowId,
+        epoch: u64,
+        body: Body,
+    ) -> BTreeSet<TopicName> {
         if self.world.flows.get(from).is_none_or(|view| view.epoch != epoch) {
             self.faults.unknown_flows += 1;
             return BTreeSet::new();
         }
         if let Body::Goodbye(_) = body {
-            if let Some(sign) = self.remotes.get_mut(from).and_then(|remote| remote.ways.layer.as_mut()) {
+            if let Some(sign) =
+                self.remotes.get_mut(from).and_then(|remote| remote.ways.layer.as_mut())
+            {
                 sign.over = true;
             }
             return self.update_reach(now, from);
@@ -165,17 +178,15 @@ impl Registry {
 
     /// Nothing can be heard while the layer broker is away, which says nothing of who lives.
     pub fn excuse_silence(&mut self, now: Instant) {
-        let signs = self
-            .remotes
-            .values_mut()
-            .filter_map(|remote| remote.ways.layer.as_mut());
+        let signs = self.remotes.values_mut().filter_map(|remote| remote.ways.layer.as_mut());
         for sign in signs.filter(|sign| !sign.over) {
             sign.at = now;
         }
     }
 
-    /// Flows that have been silent for too long are gone; flows that have been ready for long enough are settled. To be called
-    /// every few ten milliseconds. Returns the topics to plan anew.
+    /// Flows that have been silent for too long are gone; flows that have been ready for long
+    /// enough are settled. To be called every few ten milliseconds. Returns the topics to plan
+    /// anew.
     pub fn watch_flows(&mut self, now: Instant) -> BTreeSet<TopicName> {
         let mut changed = BTreeSet::new();
         let (mut silent, mut forgotten) = (Vec::new(), Vec::new());
@@ -243,8 +254,8 @@ impl Registry {
         self.all_topics()
     }
 
-    /// What is to be sent on the channel of the layer broker now, and to whom; `None` = to everybody. Call it after
-    /// [`Registry::poll`].
+    /// What is to be sent on the channel of the layer broker now, and to whom; `None` = to
+    /// everybody. Call it after [`Registry::poll`].
     pub fn poll_layer(&mut self) -> Vec<(Option<FlowId>, Body)> {
         std::mem::take(&mut self.layer_outgoing)
     }

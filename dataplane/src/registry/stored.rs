@@ -5,7 +5,8 @@
 //! key and value, read at the start ─► Registry::restore ─► lease with its whole ttl, unless a service was faster
 //! ```
 //!
-//! The value is the control message that makes the lease, so it does not change when the lease is renewed.
+//! The value is the control message that makes the lease, so it does not change when the lease is
+//! renewed.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -99,8 +100,9 @@ impl Registry {
         self.leases.take_unsaved()
     }
 
-    /// Takes the leases that the broker of a scope has kept, each with its whole ttl. One that a service has renewed or
-    /// ended meanwhile is left as it is. From then on the leases of that scope are known to be complete.
+    /// Takes the leases that the broker of a scope has kept, each with its whole ttl. One that a
+    /// service has renewed or ended meanwhile is left as it is. From then on the leases of that
+    /// scope are known to be complete.
     pub fn restore(&mut self, now: Instant, scope: Scope, kept: &[(String, Bytes)]) -> Restored {
         let mut outcome = Restored::default();
         for (key, value) in kept {
@@ -112,7 +114,11 @@ impl Registry {
                 }
                 Kept::Unreadable => {
                     outcome.skipped += 1;
-                    tracing::warn!(%scope, key = short(key), "a kept lease cannot be read and is left alone");
+                    tracing::warn!(
+                        %scope,
+                        key = short(key),
+                        "a kept lease cannot be read and is left alone",
+                    );
                     continue;
                 }
             };
@@ -143,8 +149,8 @@ impl Registry {
         outcome
     }
 
-    /// Nobody can renew leases of a scope while its broker is away, so none lapses; when it is back, each finite one has its
-    /// whole ttl.
+    /// Nobody can renew leases of a scope while its broker is away, so none lapses; when it is
+    /// back, each finite one has its whole ttl.
     pub fn set_renewable(&mut self, now: Instant, scope: Scope, renewable: bool) {
         self.leases.set_renewable(now, scope, renewable);
     }
@@ -156,7 +162,10 @@ fn short(text: &str) -> String {
 }
 
 /// Leases to write, from those that changed.
-pub(super) fn unsaved(table: &LeaseTable, changed: BTreeSet<(TopicName, LeaseKey)>) -> Vec<UnsavedLease> {
+pub(super) fn unsaved(
+    table: &LeaseTable,
+    changed: BTreeSet<(TopicName, LeaseKey)>,
+) -> Vec<UnsavedLease> {
     let entry = |(topic, key): (TopicName, LeaseKey)| UnsavedLease {
         scope: key.scope,
         key: StoredKey(&topic, &key).to_string(),

@@ -28,7 +28,8 @@ pub struct RegistryConfig {
     pub layer_scope: Option<LayerScopeId>,
     /// Most leases, at most 10,000.
     pub max_leases: usize,
-    /// Answers on the layer scope share one channel (Kafka, DDS): a message that wants one must have an `id`.
+    /// Answers on the layer scope share one channel (Kafka, DDS): a message that wants one must
+    /// have an `id`.
     pub layer_answers_need_id: bool,
     /// What the layer broker makes of topic names.
     pub layer_names: LayerNames,

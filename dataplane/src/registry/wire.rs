@@ -38,7 +38,11 @@ pub(super) enum EntryFault {
 }
 
 /// An own entry as it is announced; what does not fit is left out and said to be.
-pub(super) fn to_wire(topic: &TopicName, entry: &TopicEntry, routes: &[wire::RouteState]) -> wire::Entry {
+pub(super) fn to_wire(
+    topic: &TopicName,
+    entry: &TopicEntry,
+    routes: &[wire::RouteState],
+) -> wire::Entry {
     wire::Entry {
         topic: topic.to_string(),
         removed: false,
@@ -54,11 +58,7 @@ pub(super) fn to_wire(topic: &TopicName, entry: &TopicEntry, routes: &[wire::Rou
 
 /// Says that nothing is left of a topic.
 pub(super) fn removed(topic: &TopicName) -> wire::Entry {
-    wire::Entry {
-        topic: topic.to_string(),
-        removed: true,
-        ..wire::Entry::default()
-    }
+    wire::Entry { topic: topic.to_string(), removed: true, ..wire::Entry::default() }
 }
 
 fn advertise_to_wire(advertise: &Advertise) -> wire::Advertise {
@@ -78,16 +78,16 @@ fn advertise_to_wire(advertise: &Advertise) -> wire::Advertise {
         more_sources: true,
     };
     for source in advertise.sources.iter().take(MAX_ANNOUNCED_SOURCES) {
-        message.sources.push(wire::Source {
-            node: source.node.clone(),
-            service: source.service.clone(),
-        });
+        message
+            .sources
+            .push(wire::Source { node: source.node.clone(), service: source.service.clone() });
         if message.encoded_len() > MAX_ADVERTISE_BYTES {
             message.sources.pop();
             break;
         }
     }
-    message.more_sources = advertise.more_sources || message.sources.len() < advertise.sources.len();
+    message.more_sources =
+        advertise.more_sources || message.sources.len() < advertise.sources.len();
     message
 }
 
@@ -125,9 +125,7 @@ fn trim_route(route: &wire::RouteState) -> wire::RouteState {
 }
 
 fn cut(text: &str) -> String {
-    text.get(..text.floor_char_boundary(MAX_ROUTE_TEXT))
-        .unwrap_or_default()
-        .to_owned()
+    text.get(..text.floor_char_boundary(MAX_ROUTE_TEXT)).unwrap_or_default().to_owned()
 }
 
 /// Another flow's entry, checked.
@@ -141,7 +139,9 @@ pub(super) fn from_wire(entry: &wire::Entry) -> Result<(TopicName, TopicEntry), 
             within(text, MAX_ROUTE_TEXT, "a route state")?;
         }
     }
-    let scope = |advertise: Option<&wire::Advertise>, request: Option<&wire::Request>| -> Result<_, EntryFault> {
+    let scope = |advertise: Option<&wire::Advertise>,
+                 request: Option<&wire::Request>|
+     -> Result<_, EntryFault> {
         Ok(ScopeEntry {
             advertise: advertise.map(advertise_from_wire).transpose()?,
             request: request.map(request_from_wire).transpose()?,
@@ -156,11 +156,7 @@ pub(super) fn from_wire(entry: &wire::Entry) -> Result<(TopicName, TopicEntry), 
 }
 
 fn within(text: &str, limit: usize, what: &'static str) -> Result<(), EntryFault> {
-    if text.len() > limit {
-        Err(EntryFault::TooLong(what))
-    } else {
-        Ok(())
-    }
+    if text.len() > limit { Err(EntryFault::TooLong(what)) } else { Ok(()) }
 }
 
 fn rate_from_wire(rate: f64) -> Option<f64> {
@@ -178,10 +174,7 @@ fn advertise_from_wire(message: &wire::Advertise) -> Result<Advertise, EntryFaul
     for source in &message.sources {
         within(&source.node, MAX_NAME, "a source's node")?;
         within(&source.service, MAX_NAME, "a source's service")?;
-        sources.push(Source {
-            node: source.node.clone(),
-            service: source.service.clone(),
-        });
+        sources.push(Source { node: source.node.clone(), service: source.service.clone() });
     }
     sources.sort();
     Ok(Advertise {
@@ -244,19 +237,11 @@ fn request_from_wire(message: &wire::Request) -> Result<Request, EntryFault> {
 }
 
 fn reliability(reliable: bool) -> Reliability {
-    if reliable {
-        Reliability::Reliable
-    } else {
-        Reliability::BestEffort
-    }
+    if reliable { Reliability::Reliable } else { Reliability::BestEffort }
 }
 
 fn durability(transient_local: bool) -> Durability {
-    if transient_local {
-        Durability::TransientLocal
-    } else {
-        Durability::Volatile
-    }
+    if transient_local { Durability::TransientLocal } else { Durability::Volatile }
 }
 
 #[cfg(test)]

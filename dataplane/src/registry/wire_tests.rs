@@ -6,7 +6,8 @@ use super::super::pieces::{MAX_LINK_CONTROL_BYTES, entry_hash, join, pack, piece
 use super::*;
 
 fn text(limit: usize) -> impl Strategy<Value = String> {
-    proptest::collection::vec(b'a'..=b'z', 1..=limit).prop_map(|bytes| String::from_utf8(bytes).unwrap_or_default())
+    proptest::collection::vec(b'a'..=b'z', 1..=limit)
+        .prop_map(|bytes| String::from_utf8(bytes).unwrap_or_default())
 }
 
 fn any_advertise() -> impl Strategy<Value = Advertise> {
@@ -21,19 +22,21 @@ fn any_advertise() -> impl Strategy<Value = Advertise> {
         any::<u32>(),
     )
         .prop_map(
-            |(rate_hz, max_bytes, encoding, type_name, type_hash, sources, lifespan_ms)| Advertise {
-                rate_hz,
-                max_bytes,
-                encoding,
-                type_name,
-                type_hash,
-                reliability: Reliability::Reliable,
-                durability: Durability::TransientLocal,
-                depth: 65_535,
-                priority: Some(Priority::Bulk),
-                lifespan_ms,
-                sources: sources.into_iter().collect(),
-                more_sources: false,
+            |(rate_hz, max_bytes, encoding, type_name, type_hash, sources, lifespan_ms)| {
+                Advertise {
+                    rate_hz,
+                    max_bytes,
+                    encoding,
+                    type_name,
+                    type_hash,
+                    reliability: Reliability::Reliable,
+                    durability: Durability::TransientLocal,
+                    depth: 65_535,
+                    priority: Some(Priority::Bulk),
+                    lifespan_ms,
+                    sources: sources.into_iter().collect(),
+                    more_sources: false,
+                }
             },
         )
 }
@@ -69,10 +72,7 @@ fn any_request() -> impl Strategy<Value = Request> {
 
 fn any_entry() -> impl Strategy<Value = (TopicName, TopicEntry, Vec<wire::RouteState>)> {
     let scope = || {
-        (
-            proptest::option::of(any_advertise()),
-            proptest::option::of(any_request()),
-        )
+        (proptest::option::of(any_advertise()), proptest::option::of(any_request()))
             .prop_map(|(advertise, request)| ScopeEntry { advertise, request })
     };
     let route = (text(63), text(127), text(16), any::<bool>(), any::<u64>()).prop_map(
@@ -85,13 +85,7 @@ fn any_entry() -> impl Strategy<Value = (TopicName, TopicEntry, Vec<wire::RouteS
             next_offset,
         },
     );
-    (
-        text(200),
-        scope(),
-        scope(),
-        scope(),
-        proptest::collection::vec(route, 0..=MAX_ROUTES),
-    )
+    (text(200), scope(), scope(), scope(), proptest::collection::vec(route, 0..=MAX_ROUTES))
         .prop_map(|(topic, node, layer, outside, routes)| {
             (topic.parse().unwrap(), TopicEntry { node, layer, outside }, routes)
         })
@@ -106,19 +100,24 @@ proptest! {
 
     #[test]
     fn entries_of_any_size_fit_datagrams_and_come_back(entries in proptest::collection::vec(any_entry(), 1..5)) {
-        let whole: Vec<_> = entries.iter().map(|(topic, entry, routes)| to_wire(topic, entry, routes)).collect();
+        let whole: Vec<_> =
+            entries.iter().map(|(topic, entry, routes)| to_wire(topic, entry, routes)).collect();
         let parts = pack(whole.iter().cloned().flat_map(pieces));
         for entries in &parts {
             let largest = wire::Delta {
-                from_version: u64::MAX, to_version: u64::MAX, part: u32::MAX, parts: u32::MAX, entries: entries.clone(),
+                from_version: u64::MAX, to_version: u64::MAX, part: u32::MAX, parts: u32::MAX,
+                entries: entries.clone(),
             };
             prop_assert!(encoded(Body::Delta(largest)) <= MAX_LINK_CONTROL_BYTES);
-            let largest = wire::Snapshot { version: u64::MAX, part: u32::MAX, parts: u32::MAX, entries: entries.clone() };
+            let largest =
+                wire::Snapshot { version: u64::MAX, part: u32::MAX, parts: u32::MAX,
+                entries: entries.clone() };
             prop_assert!(encoded(Body::Snapshot(largest)) <= MAX_LINK_CONTROL_BYTES);
         }
         let joined = join(parts.into_iter().flatten());
         for (whole, (topic, entry, _)) in whole.iter().zip(&entries).rev() {
-            if whole.topic != topic.as_str() || entries.iter().filter(|(other, _, _)| other == topic).count() > 1 {
+            if whole.topic != topic.as_str()
+                || entries.iter().filter(|(other, _, _)| other == topic).count() > 1 {
                 continue;
             }
             let back = &joined[topic.as_str()];
@@ -149,10 +148,7 @@ proptest! {
 
 #[test]
 fn faulty_entries_are_named() {
-    let good = wire::Entry {
-        topic: "a".into(),
-        ..wire::Entry::default()
-    };
+    let good = wire::Entry { topic: "a".into(), ..wire::Entry::default() };
     let fault = |change: &dyn Fn(&mut wire::Entry)| {
         let mut entry = good.clone();
         change(&mut entry);
@@ -160,14 +156,8 @@ fn faulty_entries_are_named() {
     };
     assert!(from_wire(&good).is_ok());
     assert_eq!(fault(&|entry| entry.topic = "a b".into()), EntryFault::Topic);
-    assert_eq!(
-        fault(&|entry| entry.topic = "blaze/flow/control".into()),
-        EntryFault::Topic
-    );
-    let advertise = wire::Advertise {
-        encoding: "e".repeat(201),
-        ..wire::Advertise::default()
-    };
+    assert_eq!(fault(&|entry| entry.topic = "blaze/flow/control".into()), EntryFault::Topic);
+    let advertise = wire::Advertise { encoding: "e".repeat(201), ..wire::Advertise::default() };
     assert_eq!(
         fault(&|entry| entry.node_advertise = Some(advertise.clone())),
         EntryFault::TooLong("the encoding")
@@ -200,10 +190,7 @@ fn absurd_numbers_of_others_become_none() {
         };
         let (_, merged) = from_wire(&entry).unwrap();
         let advertise = merged.node.advertise.unwrap();
-        assert_eq!(
-            (advertise.rate_hz, advertise.priority, advertise.depth),
-            (None, None, 1)
-        );
+        assert_eq!((advertise.rate_hz, advertise.priority, advertise.depth), (None, None, 1));
         assert_eq!(advertise.encoding, DEFAULT_ENCODING);
     }
 }

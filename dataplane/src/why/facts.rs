@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 
-use blaze_domain::{DropReason, FlowId, LayerName, NameError, NodeName, Scope, ServiceName, TopicName, WhyCode};
+use blaze_domain::{
+    DropReason, FlowId, LayerName, NameError, NodeName, Scope, ServiceName, TopicName, WhyCode,
+};
 use serde::{Serialize, Serializer};
 
 use super::StepKind;
@@ -62,7 +64,8 @@ pub struct BridgeFacts {
     pub dropped: BTreeMap<DropReason, u64>,
     /// It is held to the rate that was advertised, because more is published.
     pub exceeds_advertised: bool,
-    /// Messages that the rules of `flow.access` kept from it during the same time; not among those of `dropped`.
+    /// Messages that the rules of `flow.access` kept from it during the same time; not among those
+    /// of `dropped`.
     pub denied: u64,
 }
 
@@ -127,7 +130,8 @@ pub struct LeaseHint {
     pub kind: StepKind,
     /// The service.
     pub service: String,
-    /// `lease_expired`, `source_mismatch`, `access_denied`, `name_not_expressible`, `name_collision`, …
+    /// `lease_expired`, `source_mismatch`, `access_denied`, `name_not_expressible`,
+    /// `name_collision`, …
     pub code: WhyCode,
     /// The facts, for people; empty where the code says all.
     pub detail: String,

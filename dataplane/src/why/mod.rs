@@ -15,13 +15,16 @@ mod tests;
 use blaze_domain::{DropReason, FlowId, Scope, TopicName, WhyCode};
 use serde::Serialize;
 
-pub use facts::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, WhyInput, WhyTarget};
+pub use facts::{
+    BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, WhyInput, WhyTarget,
+};
 
 use crate::plan::{Group, Pairing, Publisher, Requester, TopicView};
 use crate::world::{FlowState, FlowView, Reach};
 use trace::{Trace, Tracer, fault};
 
-/// Pairs of publisher and requester that are looked at; those that the flow has a part in come first.
+/// Pairs of publisher and requester that are looked at; those that the flow has a part in come
+/// first.
 const MAX_PAIRS: usize = 256;
 /// Why a flow that is not on the inter scope knows nothing of other groups.
 const NO_GATEWAY: &str = "no flow of its group is on the inter scope";
@@ -130,14 +133,8 @@ fn exceeds(facts: &BridgeFacts) -> bool {
 
 /// The worst of those that were asked for; of everybody, degraded if some are served.
 fn verdict(destinations: &[Vec<Trace>], asked: bool) -> Verdict {
-    let served = destinations
-        .iter()
-        .map(|traces| together(traces.iter().map(Trace::verdict)));
-    if asked {
-        served.max().unwrap_or(Verdict::NotFlowing)
-    } else {
-        together(served)
-    }
+    let served = destinations.iter().map(|traces| together(traces.iter().map(Trace::verdict)));
+    if asked { served.max().unwrap_or(Verdict::NotFlowing) } else { together(served) }
 }
 
 /// All, some or none.
@@ -159,14 +156,9 @@ impl<'w> Explainer<'_, 'w> {
         let requested = self.request_side();
         let (Ok(publishers), Ok(requesters)) = (&advertised, &requested) else {
             let failed = [advertised.err(), requested.err()].into_iter().flatten();
-            return vec![vec![Trace {
-                steps: failed.flat_map(|trace| trace.steps).collect(),
-            }]];
+            return vec![vec![Trace { steps: failed.flat_map(|trace| trace.steps).collect() }]];
         };
-        let tracer = Tracer {
-            input: self.input,
-            view: &self.view,
-        };
+        let tracer = Tracer { input: self.input, view: &self.view };
         let mut left = MAX_PAIRS;
         let mut destinations = Vec::new();
         for requester in requesters {
@@ -180,12 +172,15 @@ impl<'w> Explainer<'_, 'w> {
         destinations
     }
 
-    /// Publishers of flows that carry topics, each scope once, those next to this flow first; or what is wrong.
+    /// Publishers of flows that carry topics, each scope once, those next to this flow first; or
+    /// what is wrong.
     fn advertise_side(&self) -> Result<Vec<Publisher<'w>>, Trace> {
         let mut found: Vec<Publisher<'w>> = Vec::new();
         for publisher in &self.view.publishers {
             let same = |other: &Publisher<'_>| {
-                publisher.scope != Scope::Node && other.scope == publisher.scope && other.group == publisher.group
+                publisher.scope != Scope::Node
+                    && other.scope == publisher.scope
+                    && other.group == publisher.group
             };
             match found.iter_mut().find(|other| same(other)) {
                 Some(other) if publisher.flow == self.view.me => *other = *publisher,
@@ -193,13 +188,17 @@ impl<'w> Explainer<'_, 'w> {
                 None => found.push(*publisher),
             }
         }
-        found.sort_by_key(|publisher| (publisher.flow != self.view.me, publisher.group != self.view.group));
+        found.sort_by_key(|publisher| {
+            (publisher.flow != self.view.me, publisher.group != self.view.group)
+        });
         if !found.is_empty() {
             return Ok(found);
         }
         let lost = self.input.world.flows.iter().find(|(_, flow)| {
             let entry = flow.topics.get(self.input.topic);
-            entry.is_some_and(|entry| entry.node.advertise.is_some() || entry.layer.advertise.is_some())
+            entry.is_some_and(|entry| {
+                entry.node.advertise.is_some() || entry.layer.advertise.is_some()
+            })
         });
         let (flow, code, detail) = match lost {
             // A flow that waits for its broker is not merely starting.
@@ -222,15 +221,21 @@ impl<'w> Explainer<'_, 'w> {
         let all: Vec<Requester<'w>> = living.chain(self.silent_requesters()).collect();
         for requester in all.iter().filter(|requester| self.is_asked(requester, &all)) {
             let shared = |other: &Requester<'_>| {
-                requester.scope != Scope::Node && other.scope == requester.scope && other.group == requester.group
+                requester.scope != Scope::Node
+                    && other.scope == requester.scope
+                    && other.group == requester.group
             };
             match found.iter_mut().find(|other| shared(other)) {
-                Some(other) if requester.flow == self.view.me && world.carries(requester.flow) => *other = *requester,
+                Some(other) if requester.flow == self.view.me && world.carries(requester.flow) => {
+                    *other = *requester
+                }
                 Some(_) => {}
                 None => found.push(*requester),
             }
         }
-        found.sort_by_key(|requester| (requester.flow != self.view.me, requester.group != self.view.group));
+        found.sort_by_key(|requester| {
+            (requester.flow != self.view.me, requester.group != self.view.group)
+        });
         if !found.is_empty() {
             return Ok(found);
         }
@@ -251,7 +256,8 @@ impl<'w> Explainer<'_, 'w> {
             };
             for (scope, entry) in [(Scope::Node, &entry.node), (Scope::Layer, &entry.layer)] {
                 let group = Group::of(id, flow);
-                // What a lost flow said of a layer scope counts only while nobody else is there to know better.
+                // What a lost flow said of a layer scope counts only while nobody else is there to
+                // know better.
                 let known = scope == Scope::Layer && self.has_living(group);
                 silent.extend(entry.request.as_ref().filter(|_| !known).map(|request| Requester {
                     flow: id,
@@ -278,15 +284,21 @@ impl<'w> Explainer<'_, 'w> {
             return to.layer != self.view.me.layer;
         }
         let in_node = |requester: &Requester<'_>| {
-            requester.flow.layer == to.layer && to.node.as_ref().is_none_or(|node| requester.flow.node == *node)
+            requester.flow.layer == to.layer
+                && to.node.as_ref().is_none_or(|node| requester.flow.node == *node)
         };
         let node_asks = || all.iter().any(|other| other.scope == Scope::Node && in_node(other));
         in_node(requester) && (to.node.is_none() || requester.scope == Scope::Node || !node_asks())
     }
 
-    /// Why a lease is missing: nobody is heard on a scope that is another flow's or whose broker is away, it lapsed or was refused,
-    /// or there never was one.
-    fn missing(&self, kind: StepKind, code: WhyCode, nobody: impl Fn() -> String) -> (&FlowId, WhyCode, String) {
+    /// Why a lease is missing: nobody is heard on a scope that is another flow's or whose broker is
+    /// away, it lapsed or was refused, or there never was one.
+    fn missing(
+        &self,
+        kind: StepKind,
+        code: WhyCode,
+        nobody: impl Fn() -> String,
+    ) -> (&FlowId, WhyCode, String) {
         let me = self.view.me;
         let to = self.input.to.as_ref().filter(|_| kind == StepKind::Request);
         // Who is on a scope that is not read is not heard.
@@ -321,14 +333,16 @@ impl<'w> Explainer<'_, 'w> {
         self.input.leases.iter().find(|hint| {
             let to = self.input.to.as_ref().filter(|_| kind == StepKind::Request);
             let fits = to.is_none_or(|to| {
-                hint.flow.layer == to.layer && to.node.as_ref().is_none_or(|node| hint.flow.node == *node)
+                hint.flow.layer == to.layer
+                    && to.node.as_ref().is_none_or(|node| hint.flow.node == *node)
             });
             hint.kind == kind && fits
         })
     }
 }
 
-/// One trace per publisher that the requester asks for; one that says so if it asks for none of them.
+/// One trace per publisher that the requester asks for; one that says so if it asks for none of
+/// them.
 fn pairs_of<'w>(
     tracer: &Tracer<'_, 'w>,
     publishers: &[Publisher<'w>],
@@ -337,17 +351,12 @@ fn pairs_of<'w>(
 ) -> Vec<Trace> {
     // What flows outside send one another is not for a flow that is not on the inter scope to say.
     let here = |publisher: &&Publisher<'w>| [publisher.scope, requester.scope] != [Scope::Inter; 2];
-    let wanted = |publisher: &&Publisher<'w>| publisher.pairing(requester.request) != Pairing::OtherOrigin;
+    let wanted =
+        |publisher: &&Publisher<'w>| publisher.pairing(requester.request) != Pairing::OtherOrigin;
     let wanted: Vec<_> = publishers.iter().filter(here).filter(wanted).collect();
-    let all = if wanted.is_empty() {
-        publishers.iter().filter(here).take(1).collect()
-    } else {
-        wanted
-    };
-    all.into_iter()
-        .take(limit)
-        .map(|publisher| tracer.trace(publisher, requester))
-        .collect()
+    let all =
+        if wanted.is_empty() { publishers.iter().filter(here).take(1).collect() } else { wanted };
+    all.into_iter().take(limit).map(|publisher| tracer.trace(publisher, requester)).collect()
 }
 
 /// Why a flow carries nothing.

@@ -99,9 +99,7 @@ impl Setup {
         self.plan.block_layer(&self.world.me, code, "it is another's");
         let plan = &self.plan;
         self.bridges.retain(|facts| {
-            plan.bridges
-                .iter()
-                .any(|bridge| (bridge.from, &bridge.to) == (facts.from, &facts.to))
+            plan.bridges.iter().any(|bridge| (bridge.from, &bridge.to) == (facts.from, &facts.to))
         });
     }
 
@@ -147,7 +145,8 @@ const FROM_CLOUD: &[&str] = &["c/b@1 node-", "e/a@1 node+"];
 
 macro_rules! rows {
     ($($name:literal: $flows:expr, $change:expr => $verdict:ident $code:ident $($step:ident)?;)+) => {
-        vec![$(Row { name: $name, flows: $flows, change: $change, verdict: Verdict::$verdict, code: WhyCode::$code,
+        vec![$(Row { name: $name, flows: $flows, change: $change, verdict: Verdict::$verdict,
+            code: WhyCode::$code,
             step: rows!(@step $($step)?) }),+]
     };
     (@step) => { None };
@@ -166,70 +165,181 @@ fn rows() -> Vec<Row> {
         "nobody advertises": &["e/a node-"], |_| {} => NotFlowing NoAdvertise Advertise;
         "nobody requests": &["e/a node+"], |_| {} => NotFlowing NoRequest Request;
         "nobody there requests": PAIR, |s| s.to = Some("f") => NotFlowing NoRequest Request;
-        "nobody on that node requests": PAIR, |s| s.to = Some("c/x") => NotFlowing NoRequest Request;
+        "nobody on that node requests": PAIR,
+        |s| s.to = Some("c/x") => NotFlowing NoRequest Request;
         "that node requests": PAIR, |s| s.to = Some("c/b/logger") => Flowing Ok;
-        "a service of that node on the layer": &["e/a node+", "c/b@1 layer-"], |s| s.to = Some("c/b") => Flowing Ok;
-        "the advertise lapsed": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::LeaseExpired) => NotFlowing LeaseExpired Advertise;
-        "the request lapsed": &["e/a node+"], |s| s.hint(StepKind::Request, WhyCode::LeaseExpired) => NotFlowing LeaseExpired Request;
-        "a lapsed request is no lapsed advertise": &["e/a"], |s| s.hint(StepKind::Request, WhyCode::LeaseExpired) => NotFlowing NoAdvertise Advertise;
-        "a lease from elsewhere": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::SourceMismatch) => NotFlowing SourceMismatch Advertise;
-        "a name that the broker cannot express": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::NameNotExpressible) => NotFlowing NameNotExpressible Advertise;
-        "two names that are one on the broker": &["e/a node+"], |s| s.hint(StepKind::Request, WhyCode::NameCollision) => NotFlowing NameCollision Request;
-        "not allowed": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::AccessDenied) => NotFlowing AccessDenied Advertise;
-        "a requester that the rules refuse": PAIR, |s| s.ruled(json!({"request": {"deny": ["c"]}})) => NotFlowing AccessDenied Plan;
-        "one of two that the rules refuse": &["e/a node+", "c/b node-", "f/d node-"], |s| s.ruled(json!({"request": {"deny": ["c"]}})) => Degraded AccessDenied Plan;
+        "a service of that node on the layer": &["e/a node+", "c/b@1 layer-"],
+        |s| s.to = Some("c/b") => Flowing Ok;
+        "the advertise lapsed": &["e/a node-"], |s| s.hint(
+            StepKind::Advertise,
+            WhyCode::LeaseExpired,
+        ) => NotFlowing LeaseExpired Advertise;
+        "the request lapsed": &["e/a node+"], |s| s.hint(
+            StepKind::Request,
+            WhyCode::LeaseExpired,
+        ) => NotFlowing LeaseExpired Request;
+        "a lapsed request is no lapsed advertise": &["e/a"], |s| s.hint(
+            StepKind::Request,
+            WhyCode::LeaseExpired,
+        ) => NotFlowing NoAdvertise Advertise;
+        "a lease from elsewhere": &["e/a node-"], |s| s.hint(
+            StepKind::Advertise,
+            WhyCode::SourceMismatch,
+        ) => NotFlowing SourceMismatch Advertise;
+        "a name that the broker cannot express": &["e/a node-"], |s| s.hint(
+            StepKind::Advertise,
+            WhyCode::NameNotExpressible,
+        ) => NotFlowing NameNotExpressible Advertise;
+        "two names that are one on the broker": &["e/a node+"], |s| s.hint(
+            StepKind::Request,
+            WhyCode::NameCollision,
+        ) => NotFlowing NameCollision Request;
+        "not allowed": &["e/a node-"], |s| s.hint(
+            StepKind::Advertise,
+            WhyCode::AccessDenied,
+        ) => NotFlowing AccessDenied Advertise;
+        "a requester that the rules refuse": PAIR,
+        |s| s.ruled(json!({"request": {"deny": ["c"]}})) => NotFlowing AccessDenied Plan;
+        "one of two that the rules refuse": &[
+            "e/a node+",
+            "c/b node-",
+            "f/d node-",
+        ], |s| s.ruled(json!({"request": {"deny": ["c"]}})) => Degraded AccessDenied Plan;
         "the other one is allowed": &["e/a node+", "c/b node-", "f/d node-"], |s| {
             s.ruled(json!({"request": {"deny": ["c"]}}));
             s.to = Some("f");
         } => Flowing Ok;
-        "a refused one that gets what another node of its layer is sent": &["e/a node+", "c/b@1 node-", "c/d@1 node-"], |s| {
+        "a refused one that gets what another node of its layer is sent": &["e/a node+",
+            "c/b@1 node-", "c/d@1 node-"], |s| {
             s.ruled(json!({"request": {"deny": ["c/b"]}}));
             s.to = Some("c/b");
         } => Flowing Ok;
-        "the rules are no matter of others": &["f/x", "e/a node+", "c/b node-"], |s| s.ruled(json!({"request": {"deny": ["c"]}})) => Flowing Ok;
-        "the sender says that its rules refuse a node": FROM_CLOUD, |s| s.route("e/a", Some("c/b"), StepKind::Plan, WhyCode::AccessDenied) => NotFlowing AccessDenied Plan;
-        "the sender says that its rules refuse a layer": &["c/b@1 layer-", "e/a@1 node+"], |s| s.denied_layer("e/a", "c/b") => NotFlowing AccessDenied Plan;
-        "a layer that is refused is not its nodes": FROM_CLOUD, |s| s.denied_layer("e/a", "c/b") => Flowing Ok;
-        "a publisher that the rules refuse": FROM_CLOUD, |s| s.ruled(json!({"advertise": {"deny": ["e"]}})) => NotFlowing AccessDenied Plan;
-        "the receiver says that its rules refuse who publishes": PAIR, |s| s.route("c/b", Some("c/b"), StepKind::Plan, WhyCode::AccessDenied) => NotFlowing AccessDenied Plan;
-        "all messages are refused by the rules": FROM_CLOUD, |s| s.denies(0) => NotFlowing AccessDenied Admit;
-        "some messages are refused by the rules": PAIR, |s| s.denies(4) => Degraded AccessDenied Admit;
-        "no room for another lease": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::TooManyLeases) => NotFlowing TooManyLeases Advertise;
-        "no such origin": PAIR, |s| { ask(&mut s.world, "c/b", "node").from = vec![filter("x/*/*")]; s.replan(); } => NotFlowing NoMatchingOrigin Plan;
+        "the rules are no matter of others": &["f/x", "e/a node+", "c/b node-"],
+        |s| s.ruled(json!({"request": {"deny": ["c"]}})) => Flowing Ok;
+        "the sender says that its rules refuse a node": FROM_CLOUD, |s| s.route(
+            "e/a",
+            Some("c/b"),
+            StepKind::Plan,
+            WhyCode::AccessDenied,
+        ) => NotFlowing AccessDenied Plan;
+        "the sender says that its rules refuse a layer": &["c/b@1 layer-", "e/a@1 node+"],
+        |s| s.denied_layer("e/a", "c/b") => NotFlowing AccessDenied Plan;
+        "a layer that is refused is not its nodes": FROM_CLOUD,
+        |s| s.denied_layer("e/a", "c/b") => Flowing Ok;
+        "a publisher that the rules refuse": FROM_CLOUD,
+        |s| s.ruled(json!({"advertise": {"deny": ["e"]}})) => NotFlowing AccessDenied Plan;
+        "the receiver says that its rules refuse who publishes": PAIR, |s| s.route(
+            "c/b",
+            Some("c/b"),
+            StepKind::Plan,
+            WhyCode::AccessDenied,
+        ) => NotFlowing AccessDenied Plan;
+        "all messages are refused by the rules": FROM_CLOUD,
+        |s| s.denies(0) => NotFlowing AccessDenied Admit;
+        "some messages are refused by the rules": PAIR,
+        |s| s.denies(4) => Degraded AccessDenied Admit;
+        "no room for another lease": &["e/a node-"], |s| s.hint(
+            StepKind::Advertise,
+            WhyCode::TooManyLeases,
+        ) => NotFlowing TooManyLeases Advertise;
+        "no such origin": PAIR,
+        |s| { ask(&mut s.world, "c/b", "node").from = vec![filter("x/*/*")]; s.replan(); } =>
+        NotFlowing NoMatchingOrigin Plan;
         "other types": PAIR, |s| {
             offer(&mut s.world, "e/a", "node").type_name = "a/A".to_owned();
             ask(&mut s.world, "c/b", "node").type_name = "b/B".to_owned();
             s.replan();
         } => NotFlowing TypeMismatch Plan;
-        "more asked than offered": PAIR, |s| { ask(&mut s.world, "c/b", "node").reliability = Reliability::Reliable; s.replan(); } => Degraded QosMismatch Plan;
-        "late joiners ask for more": PAIR, |s| { ask(&mut s.world, "c/b", "node").durability = Durability::TransientLocal; s.replan(); } => Degraded QosMismatch Plan;
-        "the requester is down": &["e/a node+", "c/b down node-"], |_| {} => NotFlowing PeerDown Link;
-        "a lost flow's word of a layer where others live": &["e/a node+", "c/b@1", "c/d@1 down layer-"], |_| {} => NotFlowing NoRequest Request;
-        "a lost flow's word of a layer of its own": &["e/a node+", "c/d@1 down layer-"], |_| {} => NotFlowing PeerDown Link;
-        "the requester goes away": &["e/a node+", "c/b draining node-"], |_| {} => NotFlowing PeerDown Link;
-        "the requester starts": &["e/a node+", "c/b starting node-"], |_| {} => NotFlowing BridgeStarting Plan;
-        "the publisher is down": &["c/b node-", "e/a down node+"], |_| {} => NotFlowing PeerDown Advertise;
-        "the publisher starts": &["e/a starting node+", "c/b node-"], |_| {} => NotFlowing BridgeStarting Advertise;
-        "the receiver does not answer": &["e/a node+", "c/b suspect node-"], |_| {} => NotFlowing PeerSuspect Link;
-        "the sender does not answer": &["c/b node-", "e/a suspect node+"], |_| {} => NotFlowing PeerSuspect Link;
-        "one of two is down": &["e/a node+", "c/b node-", "c/d down node-"], |_| {} => Degraded PeerDown Link;
-        "the one that is meant is down": &["e/a node+", "c/b node-", "c/d down node-"], |s| s.to = Some("c/d") => NotFlowing PeerDown Link;
-        "the other one is meant": &["e/a node+", "c/b node-", "c/d down node-"], |s| s.to = Some("c/b") => Flowing Ok;
-        "the worst in the layer that is meant": &["e/a node+", "c/b node-", "c/d down node-"], |s| s.to = Some("c") => NotFlowing PeerDown Link;
-        "not planned yet": PAIR, |s| { s.plan = TopicPlan::default(); s.bridges.clear(); } => NotFlowing BridgeStarting Bridge;
+        "more asked than offered": PAIR,
+        |s| { ask(&mut s.world, "c/b", "node").reliability = Reliability::Reliable; s.replan(); } =>
+        Degraded QosMismatch Plan;
+        "late joiners ask for more": PAIR,
+        |s| { ask(&mut s.world, "c/b", "node").durability = Durability::TransientLocal; s
+        .replan(); } => Degraded QosMismatch Plan;
+        "the requester is down": &["e/a node+", "c/b down node-"],
+        |_| {} => NotFlowing PeerDown Link;
+        "a lost flow's word of a layer where others live": &[
+            "e/a node+",
+            "c/b@1",
+            "c/d@1 down layer-",
+        ], |_| {} => NotFlowing NoRequest Request;
+        "a lost flow's word of a layer of its own": &[
+            "e/a node+",
+            "c/d@1 down layer-",
+        ], |_| {} => NotFlowing PeerDown Link;
+        "the requester goes away": &[
+            "e/a node+",
+            "c/b draining node-",
+        ], |_| {} => NotFlowing PeerDown Link;
+        "the requester starts": &[
+            "e/a node+",
+            "c/b starting node-",
+        ], |_| {} => NotFlowing BridgeStarting Plan;
+        "the publisher is down": &["c/b node-", "e/a down node+"],
+        |_| {} => NotFlowing PeerDown Advertise;
+        "the publisher starts": &[
+            "e/a starting node+",
+            "c/b node-",
+        ], |_| {} => NotFlowing BridgeStarting Advertise;
+        "the receiver does not answer": &[
+            "e/a node+",
+            "c/b suspect node-",
+        ], |_| {} => NotFlowing PeerSuspect Link;
+        "the sender does not answer": &[
+            "c/b node-",
+            "e/a suspect node+",
+        ], |_| {} => NotFlowing PeerSuspect Link;
+        "one of two is down": &[
+            "e/a node+",
+            "c/b node-",
+            "c/d down node-",
+        ], |_| {} => Degraded PeerDown Link;
+        "the one that is meant is down": &[
+            "e/a node+",
+            "c/b node-",
+            "c/d down node-",
+        ], |s| s.to = Some("c/d") => NotFlowing PeerDown Link;
+        "the other one is meant": &[
+            "e/a node+",
+            "c/b node-",
+            "c/d down node-",
+        ], |s| s.to = Some("c/b") => Flowing Ok;
+        "the worst in the layer that is meant": &[
+            "e/a node+",
+            "c/b node-",
+            "c/d down node-",
+        ], |s| s.to = Some("c") => NotFlowing PeerDown Link;
+        "not planned yet": PAIR,
+        |s| { s.plan = TopicPlan::default(); s.bridges.clear(); } =>
+        NotFlowing BridgeStarting Bridge;
         "planned, not made": PAIR, |s| s.bridges.clear() => NotFlowing BridgeStarting Bridge;
-        "being made": PAIR, |s| s.bridges[0].state = BridgeState::Starting => NotFlowing BridgeStarting Bridge;
-        "not made": PAIR, |s| s.bridges[0].state = BridgeState::Failed("refused".to_owned()) => NotFlowing BridgeFailed Bridge;
-        "the intake is not made": FROM_CLOUD, |s| s.bridges[0].state = BridgeState::Failed("refused".to_owned()) => NotFlowing BridgeFailed Bridge;
-        "an intake that no plan expected delivers": FROM_CLOUD, |s| { s.plan = TopicPlan::default(); s.bridges.clear(); } => Flowing Ok;
-        "the source broker is away": PAIR, |s| s.node_broker.health = BrokerHealth::Down => NotFlowing BrokerDown Bridge;
-        "the target broker is away": FROM_CLOUD, |s| s.node_broker.health = BrokerHealth::Down => NotFlowing BrokerDown Deliver;
-        "another broker is away": PAIR, |s| s.layer_broker.health = BrokerHealth::Down => Flowing Ok;
-        "another flow uses the source": PAIR, |s| s.node_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Bridge;
-        "another flow uses the target": &["e/a@1 node+ layer-"], |s| s.layer_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Deliver;
-        "another flow uses the scope where it would be advertised": &["e/a@1 layer-"], |s| s.node_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Advertise;
-        "another flow uses the scope where it would be requested": &["e/a@1 node+"], |s| s.layer_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Request;
-        "what a scope that is in use has to do with another layer": &["e/a@1 node+"], |s| { s.layer_broker.health = BrokerHealth::InUse; s.to = Some("c"); } => NotFlowing NoRequest Request;
+        "being made": PAIR,
+        |s| s.bridges[0].state = BridgeState::Starting => NotFlowing BridgeStarting Bridge;
+        "not made": PAIR,
+        |s| s.bridges[0].state = BridgeState::Failed("refused".to_owned()) =>
+        NotFlowing BridgeFailed Bridge;
+        "the intake is not made": FROM_CLOUD,
+        |s| s.bridges[0].state = BridgeState::Failed("refused".to_owned()) =>
+        NotFlowing BridgeFailed Bridge;
+        "an intake that no plan expected delivers": FROM_CLOUD,
+        |s| { s.plan = TopicPlan::default(); s.bridges.clear(); } => Flowing Ok;
+        "the source broker is away": PAIR,
+        |s| s.node_broker.health = BrokerHealth::Down => NotFlowing BrokerDown Bridge;
+        "the target broker is away": FROM_CLOUD,
+        |s| s.node_broker.health = BrokerHealth::Down => NotFlowing BrokerDown Deliver;
+        "another broker is away": PAIR,
+        |s| s.layer_broker.health = BrokerHealth::Down => Flowing Ok;
+        "another flow uses the source": PAIR,
+        |s| s.node_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Bridge;
+        "another flow uses the target": &["e/a@1 node+ layer-"],
+        |s| s.layer_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Deliver;
+        "another flow uses the scope where it would be advertised": &["e/a@1 layer-"],
+        |s| s.node_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Advertise;
+        "another flow uses the scope where it would be requested": &["e/a@1 node+"],
+        |s| s.layer_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Request;
+        "what a scope that is in use has to do with another layer": &["e/a@1 node+"],
+        |s| { s.layer_broker.health = BrokerHealth::InUse; s.to = Some("c"); } =>
+        NotFlowing NoRequest Request;
         "a lease that lapsed because the scope is another's": &["e/a@1 layer-"], |s| {
             s.node_broker.health = BrokerHealth::InUse;
             s.hint(StepKind::Advertise, WhyCode::LeaseExpired);
@@ -238,37 +348,83 @@ fn rows() -> Vec<Row> {
             s.node_broker.health = BrokerHealth::Down;
             s.drops(DropReason::QueueFull, 0);
         } => NotFlowing BrokerDown Deliver;
-        "the broker is slower than the publisher": FROM_CLOUD, |s| s.drops(DropReason::QueueFull, 4) => Degraded RateLimited Deliver;
-        "larger than the topic of the broker carries": FROM_CLOUD, |s| s.drops(DropReason::TooLarge, 0) => NotFlowing TooLarge Admit;
-        "a name that is another's on the layer broker": &["e/a@1 node+", "e/b@1 node-"], |s| s.block_layer(WhyCode::NameCollision) => NotFlowing NameCollision Plan;
-        "a name that the layer broker cannot have": &["e/a@1 node+ layer-"], |s| s.block_layer(WhyCode::NameNotExpressible) => NotFlowing NameNotExpressible Plan;
-        "a way from the layer that it cannot have": &["e/b@1 node-", "e/a@1 node+"], |s| s.block_layer(WhyCode::NameCollision) => NotFlowing NameCollision Plan;
-        "a way past the layer that cannot have it": PAIR, |s| s.block_layer(WhyCode::NameCollision) => Flowing Ok;
-        "the writer's flow says that its layer broker cannot have it": &["e/b@1 node-", "e/a@1 node+"], |s| s.route("e/a", None, StepKind::Plan, WhyCode::NameCollision) => NotFlowing NameCollision Plan;
-        "the receiver says that its broker is away": PAIR, |s| s.route("c/b", Some("c/b"), StepKind::Deliver, WhyCode::BrokerDown) => NotFlowing BrokerDown Deliver;
+        "the broker is slower than the publisher": FROM_CLOUD,
+        |s| s.drops(DropReason::QueueFull, 4) => Degraded RateLimited Deliver;
+        "larger than the topic of the broker carries": FROM_CLOUD,
+        |s| s.drops(DropReason::TooLarge, 0) => NotFlowing TooLarge Admit;
+        "a name that is another's on the layer broker": &["e/a@1 node+", "e/b@1 node-"],
+        |s| s.block_layer(WhyCode::NameCollision) => NotFlowing NameCollision Plan;
+        "a name that the layer broker cannot have": &["e/a@1 node+ layer-"],
+        |s| s.block_layer(WhyCode::NameNotExpressible) => NotFlowing NameNotExpressible Plan;
+        "a way from the layer that it cannot have": &["e/b@1 node-", "e/a@1 node+"],
+        |s| s.block_layer(WhyCode::NameCollision) => NotFlowing NameCollision Plan;
+        "a way past the layer that cannot have it": PAIR,
+        |s| s.block_layer(WhyCode::NameCollision) => Flowing Ok;
+        "the writer's flow says that its layer broker cannot have it": &["e/b@1 node-",
+            "e/a@1 node+"], |s| s.route(
+            "e/a",
+            None,
+            StepKind::Plan,
+            WhyCode::NameCollision,
+        ) => NotFlowing NameCollision Plan;
+        "the receiver says that its broker is away": PAIR, |s| s.route(
+            "c/b",
+            Some("c/b"),
+            StepKind::Deliver,
+            WhyCode::BrokerDown,
+        ) => NotFlowing BrokerDown Deliver;
         "the receiver delivers in one way and not in the other": PAIR, |s| {
             s.route("c/b", Some("c/b"), StepKind::Deliver, WhyCode::Ok);
             s.route("c/b", Some("c/b"), StepKind::Deliver, WhyCode::ScopeInUse);
         } => NotFlowing ScopeInUse Deliver;
-        "no budget at all": PAIR, |s| s.drops(DropReason::RateLimit, 0) => NotFlowing BudgetStarved Admit;
-        "less budget than rate": PAIR, |s| s.drops(DropReason::RateLimit, 4) => Degraded RateLimited Admit;
+        "no budget at all": PAIR,
+        |s| s.drops(DropReason::RateLimit, 0) => NotFlowing BudgetStarved Admit;
+        "less budget than rate": PAIR,
+        |s| s.drops(DropReason::RateLimit, 4) => Degraded RateLimited Admit;
         "thinned as asked": PAIR, |s| s.drops(DropReason::MaxRate, 4) => Flowing Ok;
-        "the queue overflows": PAIR, |s| s.drops(DropReason::QueueFull, 4) => Degraded RateLimited Link;
+        "the queue overflows": PAIR,
+        |s| s.drops(DropReason::QueueFull, 4) => Degraded RateLimited Link;
         "all too large": PAIR, |s| s.drops(DropReason::TooLarge, 0) => NotFlowing TooLarge Admit;
         "some too large": PAIR, |s| s.drops(DropReason::TooLarge, 9) => Degraded TooLarge Admit;
-        "too old on the link": PAIR, |s| s.drops(DropReason::Lifespan, 0) => NotFlowing Lifespan Link;
-        "too old on arrival": FROM_CLOUD, |s| s.drops(DropReason::Lifespan, 0) => NotFlowing Lifespan Deliver;
+        "too old on the link": PAIR,
+        |s| s.drops(DropReason::Lifespan, 0) => NotFlowing Lifespan Link;
+        "too old on arrival": FROM_CLOUD,
+        |s| s.drops(DropReason::Lifespan, 0) => NotFlowing Lifespan Deliver;
         "the link went down": PAIR, |s| s.drops(DropReason::LinkDown, 5) => Degraded PeerDown Link;
-        "the broker refuses": FROM_CLOUD, |s| s.drops(DropReason::BrokerError, 0) => NotFlowing BrokerDown Deliver;
-        "messages of another type": PAIR, |s| s.drops(DropReason::TypeMismatch, 0) => NotFlowing TypeMismatch Admit;
-        "messages from elsewhere": PAIR, |s| s.drops(DropReason::ForeignOrigin, 0) => NotFlowing SourceMismatch Admit;
+        "the broker refuses": FROM_CLOUD,
+        |s| s.drops(DropReason::BrokerError, 0) => NotFlowing BrokerDown Deliver;
+        "messages of another type": PAIR,
+        |s| s.drops(DropReason::TypeMismatch, 0) => NotFlowing TypeMismatch Admit;
+        "messages from elsewhere": PAIR,
+        |s| s.drops(DropReason::ForeignOrigin, 0) => NotFlowing SourceMismatch Admit;
         "repeats are no fault": PAIR, |s| s.drops(DropReason::Duplicate, 5) => Flowing Ok;
-        "the sender says why": FROM_CLOUD, |s| s.route("e/a", Some("c/b"), StepKind::Admit, WhyCode::BudgetStarved) => NotFlowing BudgetStarved Admit;
-        "the sender says that all is well": FROM_CLOUD, |s| s.route("e/a", Some("c/b"), StepKind::Deliver, WhyCode::Ok) => Flowing Ok;
-        "the receiver says why": PAIR, |s| s.route("c/b", None, StepKind::Deliver, WhyCode::BrokerDown) => NotFlowing BrokerDown Deliver;
-        "a route to somewhere else says nothing": FROM_CLOUD, |s| s.route("e/a", Some("f/x"), StepKind::Admit, WhyCode::BudgetStarved) => Flowing Ok;
+        "the sender says why": FROM_CLOUD, |s| s.route(
+            "e/a",
+            Some("c/b"),
+            StepKind::Admit,
+            WhyCode::BudgetStarved,
+        ) => NotFlowing BudgetStarved Admit;
+        "the sender says that all is well": FROM_CLOUD, |s| s.route(
+            "e/a",
+            Some("c/b"),
+            StepKind::Deliver,
+            WhyCode::Ok,
+        ) => Flowing Ok;
+        "the receiver says why": PAIR, |s| s.route(
+            "c/b",
+            None,
+            StepKind::Deliver,
+            WhyCode::BrokerDown,
+        ) => NotFlowing BrokerDown Deliver;
+        "a route to somewhere else says nothing": FROM_CLOUD, |s| s.route(
+            "e/a",
+            Some("f/x"),
+            StepKind::Admit,
+            WhyCode::BudgetStarved,
+        ) => Flowing Ok;
         "a native path": PAIR, |s| s.routes.push(RouteFacts {
-            flow: id("c/b"), to_layer: id("c/b").layer, receiver: None, step: StepKind::Deliver, ok: true, code: WhyCode::NativePath,
+            flow: id("c/b"), to_layer: id("c/b").layer, receiver: None, step: StepKind::Deliver,
+            ok: true, code: WhyCode::NativePath,
         }) => Flowing Ok;
     }
 }
@@ -283,10 +439,7 @@ fn whoever_publishes_more_than_it_says_is_told_so() {
     let why = setup.why();
     assert_eq!((why.code, why.remedy), (WhyCode::RateLimited, remedy::OF_AN_EXCESS));
     let admit = why.steps.iter().find(|step| step.code == WhyCode::RateLimited).unwrap();
-    assert!(
-        admit.detail.ends_with("more is published than was advertised"),
-        "{admit:?}"
-    );
+    assert!(admit.detail.ends_with("more is published than was advertised"), "{admit:?}");
     // Skipped for nothing of the kind.
     setup.bridges[0].dropped.clear();
     setup.drops(DropReason::QueueFull, 4);
@@ -300,16 +453,8 @@ fn verdict_and_cause_of_each_case() {
         let mut setup = Setup::new(world(row.flows));
         (row.change)(&mut setup);
         let why = setup.why();
-        assert_eq!(
-            (why.verdict, why.code),
-            (row.verdict, row.code),
-            "{}: {why:#?}",
-            row.name
-        );
-        let naming = why
-            .steps
-            .iter()
-            .find(|step| step.code == row.code && row.code != WhyCode::Ok);
+        assert_eq!((why.verdict, why.code), (row.verdict, row.code), "{}: {why:#?}", row.name);
+        let naming = why.steps.iter().find(|step| step.code == row.code && row.code != WhyCode::Ok);
         assert_eq!(naming.map(|step| step.step), row.step, "{}: {why:#?}", row.name);
         let failing = why.steps.iter().find(|step| !step.ok);
         assert!(
@@ -317,11 +462,7 @@ fn verdict_and_cause_of_each_case() {
             "{}: the first failing step names the code",
             row.name
         );
-        assert!(
-            why.steps.iter().all(|step| step.ok || step.code != WhyCode::Ok),
-            "{}",
-            row.name
-        );
+        assert!(why.steps.iter().all(|step| step.ok || step.code != WhyCode::Ok), "{}", row.name);
         assert!(!why.remedy.is_empty());
         seen.extend(why.steps.iter().map(|step| step.code).chain([why.code]));
     }
@@ -345,17 +486,10 @@ fn a_replica_names_the_one_that_carries_the_topic() {
     let why = setup.why();
     assert_eq!((why.verdict, why.code), (Verdict::NotFlowing, WhyCode::NotOwner));
     let step = why.steps.iter().find(|step| !step.ok).unwrap();
-    assert!(
-        step.step == StepKind::Plan && step.detail.contains(&owner.to_string()),
-        "{step:?}"
-    );
+    assert!(step.step == StepKind::Plan && step.detail.contains(&owner.to_string()), "{step:?}");
     setup.route(&owner.to_string(), Some("c/x"), StepKind::Deliver, WhyCode::Ok);
     let why = setup.why();
-    assert_eq!(
-        (why.verdict, why.code),
-        (Verdict::Flowing, WhyCode::Ok),
-        "it says that it flows"
-    );
+    assert_eq!((why.verdict, why.code), (Verdict::Flowing, WhyCode::Ok), "it says that it flows");
     let named = why.steps.iter().find(|step| step.code == WhyCode::NotOwner).unwrap();
     assert!(named.ok && named.detail.contains(&owner.to_string()), "{named:?}");
 }
@@ -388,7 +522,8 @@ fn a_broker_that_is_another_s_or_away_is_described() {
         detail: "edge/robot-7 holds it".to_owned(),
         at_most_once: true,
     };
-    let detail = |setup: &Setup| setup.why().steps.iter().find(|step| !step.ok).unwrap().detail.clone();
+    let detail =
+        |setup: &Setup| setup.why().steps.iter().find(|step| !step.ok).unwrap().detail.clone();
     assert_eq!(detail(&setup), "another flow uses this redis: edge/robot-7 holds it");
     assert!(setup.why().remedy.contains("`prefix`"));
     setup.node_broker.health = BrokerHealth::Down;
@@ -416,9 +551,7 @@ fn redis_says_that_it_is_at_most_once() {
     let why = setup.why();
     assert_eq!(why.verdict, Verdict::Flowing);
     assert!(
-        why.steps
-            .iter()
-            .any(|step| step.detail.contains("redis 7.0.15 delivers at most once")),
+        why.steps.iter().any(|step| step.detail.contains("redis 7.0.15 delivers at most once")),
         "{why:#?}"
     );
 }
@@ -430,11 +563,7 @@ fn an_answer_is_bounded_and_the_cause_comes_first() {
     lines.push("f/z down node-".to_owned());
     let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
     let mut setup = Setup::new(world(&lines));
-    entry(&mut setup.world, "c/n0", "node")
-        .request
-        .as_mut()
-        .unwrap()
-        .type_name = "b/B".to_owned();
+    entry(&mut setup.world, "c/n0", "node").request.as_mut().unwrap().type_name = "b/B".to_owned();
     offer(&mut setup.world, "e/a", "node").type_name = "a/A".to_owned();
     setup.replan();
     let why = setup.why();
@@ -468,12 +597,12 @@ fn why_and_the_planner_agree_in_random_systems() {
             if why.steps.len() == MAX_STEPS {
                 continue;
             }
-            let own = why
-                .steps
-                .iter()
-                .filter(|step| step.step == StepKind::Bridge && step.flow == me);
+            let own =
+                why.steps.iter().filter(|step| step.step == StepKind::Bridge && step.flow == me);
             let looked_for: BTreeSet<String> = own.map(|step| step.detail.clone()).collect();
-            let way = |bridge: &crate::plan::Bridge| format!("{} to {}", bridge.from, trace::describe(&bridge.to));
+            let way = |bridge: &crate::plan::Bridge| {
+                format!("{} to {}", bridge.from, trace::describe(&bridge.to))
+            };
             let planned: BTreeSet<String> = setup.plan.bridges.iter().map(way).collect();
             let missing: Vec<_> = looked_for.difference(&planned).collect();
             assert!(missing.is_empty(), "seed {seed} {me}: {missing:?}\n{:#?}", setup.plan);

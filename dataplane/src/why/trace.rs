@@ -4,9 +4,13 @@ use std::fmt::Write as _;
 
 use blaze_domain::{DropReason, FlowId, Reliability, Scope, WhyCode};
 
-use super::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, Step, StepKind, Verdict, WhyInput, absence, absent};
+use super::{
+    BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, Step, StepKind, Verdict, WhyInput,
+    absence, absent,
+};
 use crate::plan::{
-    Blocked, Destination, Pairing, Publisher, Requester, Target, TopicView, asks_too_much, meets_directly, type_detail,
+    Blocked, Destination, Pairing, Publisher, Requester, Target, TopicView, asks_too_much,
+    meets_directly, type_detail,
 };
 use crate::world::Reach;
 
@@ -32,14 +36,15 @@ impl Trace {
         self.add(flow, step, false, code, detail);
     }
 
-    fn add(&mut self, flow: &FlowId, step: StepKind, ok: bool, code: WhyCode, detail: impl Into<String>) {
-        self.steps.push(Step {
-            flow: flow.clone(),
-            step,
-            ok,
-            code,
-            detail: detail.into(),
-        });
+    fn add(
+        &mut self,
+        flow: &FlowId,
+        step: StepKind,
+        ok: bool,
+        code: WhyCode,
+        detail: impl Into<String>,
+    ) {
+        self.steps.push(Step { flow: flow.clone(), step, ok, code, detail: detail.into() });
     }
 
     pub(super) fn verdict(&self) -> Verdict {
@@ -56,9 +61,9 @@ impl Trace {
     pub(super) fn code(&self) -> WhyCode {
         let failing = self.steps.iter().find(|step| !step.ok);
         let remark = || {
-            self.steps
-                .iter()
-                .find(|step| !matches!(step.code, WhyCode::Ok | WhyCode::NativePath | WhyCode::NotOwner))
+            self.steps.iter().find(|step| {
+                !matches!(step.code, WhyCode::Ok | WhyCode::NativePath | WhyCode::NotOwner)
+            })
         };
         failing.or_else(remark).map_or(WhyCode::Ok, |step| step.code)
     }
@@ -97,7 +102,12 @@ impl<'w> Tracer<'_, 'w> {
     }
 
     /// Whether the two match at all; the hops say the rest.
-    fn plan(&self, trace: &mut Trace, publisher: &Publisher<'w>, requester: &Requester<'w>) -> bool {
+    fn plan(
+        &self,
+        trace: &mut Trace,
+        publisher: &Publisher<'w>,
+        requester: &Requester<'w>,
+    ) -> bool {
         let (flow, plan) = (publisher.flow, StepKind::Plan);
         match publisher.pairing(requester.request) {
             Pairing::OtherOrigin => {
@@ -114,11 +124,8 @@ impl<'w> Tracer<'_, 'w> {
         if let Some(view) = self.input.world.flows.get(requester.flow)
             && !self.input.world.carries(requester.flow)
         {
-            let step = if absent(view) == WhyCode::PeerDown {
-                StepKind::Link
-            } else {
-                StepKind::Plan
-            };
+            let step =
+                if absent(view) == WhyCode::PeerDown { StepKind::Link } else { StepKind::Plan };
             trace.fail(requester.flow, step, absent(view), absence(requester.flow, view));
             return false;
         }
@@ -143,7 +150,8 @@ impl<'w> Tracer<'_, 'w> {
         true
     }
 
-    /// What the gateways say of their way into the layer or out of it, for a flow that is not on the inter scope.
+    /// What the gateways say of their way into the layer or out of it, for a flow that is not on
+    /// the inter scope.
     fn over_gateways(&self, trace: &mut Trace, step: StepKind) {
         let gateways = self.view.gateways();
         let here = &self.view.me.layer;
@@ -168,10 +176,14 @@ impl<'w> Tracer<'_, 'w> {
         }
     }
 
-    /// Of several flows that share a layer broker one carries what is published there: the others say which.
+    /// Of several flows that share a layer broker one carries what is published there: the others
+    /// say which.
     fn note_owner(&self, trace: &mut Trace, publisher: &Publisher<'w>, requester: &Requester<'w>) {
         let leaves = publisher.scope == Scope::Layer && publisher.group == self.view.group;
-        if !leaves || requester.group == publisher.group || self.view.own_layer_publisher().is_none() {
+        if !leaves
+            || requester.group == publisher.group
+            || self.view.own_layer_publisher().is_none()
+        {
             return;
         }
         if let Some(owner) = self.view.owner().filter(|owner| *owner != self.view.me) {
@@ -182,12 +194,15 @@ impl<'w> Tracer<'_, 'w> {
 
     /// A broker that loses messages of reliable topics says so.
     fn note_broker(&self, trace: &mut Trace, publisher: &Publisher<'w>, requester: &Requester<'w>) {
-        let reliable = [publisher.advertise.reliability, requester.request.reliability] == [Reliability::Reliable; 2];
+        let reliable = [publisher.advertise.reliability, requester.request.reliability]
+            == [Reliability::Reliable; 2];
         let ends = [(publisher.flow, publisher.scope), (requester.flow, requester.scope)];
         let mut own = ends.iter().filter(|(flow, _)| *flow == self.view.me);
-        let broker = own.find_map(|(_, scope)| self.broker(*scope).filter(|broker| broker.at_most_once));
+        let broker =
+            own.find_map(|(_, scope)| self.broker(*scope).filter(|broker| broker.at_most_once));
         if let (true, Some(broker), Some(step)) = (reliable, broker, trace.steps.last_mut()) {
-            let _ = write!(step.detail, "; {} delivers at most once whatever is asked", broker.name);
+            let _ =
+                write!(step.detail, "; {} delivers at most once whatever is asked", broker.name);
         }
     }
 
@@ -196,7 +211,8 @@ impl<'w> Tracer<'_, 'w> {
         let hop = |flow, from, to| Hop { flow, from, to };
         let framed = requester.request.framed.then_some(Target::Node { bare: false });
         let bare = requester.request.bare.then_some(Target::Node { bare: true });
-        let node = |flow, from| framed.iter().chain(&bare).map(move |to| hop(flow, from, to.clone()));
+        let node =
+            |flow, from| framed.iter().chain(&bare).map(move |to| hop(flow, from, to.clone()));
         let mut hops = Vec::new();
         let on_node = requester.scope == Scope::Node;
         if meets_directly(publisher, requester)
@@ -204,13 +220,15 @@ impl<'w> Tracer<'_, 'w> {
         {
             // On one node a bare request alone needs a copy; framed ones read what is published.
             hops.extend(
-                bare.filter(|_| on_node)
-                    .map(|bare| hop(requester.flow, Scope::Node, bare)),
+                bare.filter(|_| on_node).map(|bare| hop(requester.flow, Scope::Node, bare)),
             );
             return hops;
         }
         if publisher.group == requester.group {
-            hops.extend((publisher.scope == Scope::Node).then(|| hop(publisher.flow, Scope::Node, Target::Layer)));
+            hops.extend(
+                (publisher.scope == Scope::Node)
+                    .then(|| hop(publisher.flow, Scope::Node, Target::Layer)),
+            );
             hops.extend(node(requester.flow, Scope::Layer).filter(|_| on_node));
             return hops;
         }
@@ -223,10 +241,7 @@ impl<'w> Tracer<'_, 'w> {
         let Some(receiver) = self.receiver(sender, publisher, requester) else {
             return hops;
         };
-        let target = Target::Inter {
-            layer: receiver.layer.clone(),
-            receiver: receiver.clone(),
-        };
+        let target = Target::Inter { layer: receiver.layer.clone(), receiver: receiver.clone() };
         hops.push(hop(sender, publisher.scope, target));
         if on_node && requester.flow == receiver {
             hops.extend(node(receiver, Scope::Inter));
@@ -238,14 +253,15 @@ impl<'w> Tracer<'_, 'w> {
     }
 
     /// The flow that the sender chose: as planned here, as it says, else as it would choose.
-    fn receiver(&self, sender: &FlowId, publisher: &Publisher<'w>, requester: &Requester<'w>) -> Option<&'w FlowId> {
+    fn receiver(
+        &self,
+        sender: &FlowId,
+        publisher: &Publisher<'w>,
+        requester: &Requester<'w>,
+    ) -> Option<&'w FlowId> {
         let kept: Vec<&FlowId> = if sender == self.view.me {
-            let targets = self
-                .input
-                .plan
-                .bridges
-                .iter()
-                .filter(|bridge| bridge.from == publisher.scope);
+            let targets =
+                self.input.plan.bridges.iter().filter(|bridge| bridge.from == publisher.scope);
             targets.filter_map(|bridge| bridge.to.receiver()).collect()
         } else {
             let routes = self.input.routes.iter().filter(|route| route.flow == *sender);
@@ -283,7 +299,8 @@ impl<'w> Tracer<'_, 'w> {
             Target::Inter { layer, receiver } => (layer, Some(receiver)),
             Target::Node { .. } | Target::Layer => (&hop.flow.layer, None),
         };
-        // A way that ends in the flow's own layer names the flow itself, or nobody where it is blocked.
+        // A way that ends in the flow's own layer names the flow itself, or nobody where it is
+        // blocked.
         let fits = |route: &&super::RouteFacts| {
             let to = route.receiver.as_ref();
             let same = to == receiver || (receiver.is_none() && to == Some(hop.flow));
@@ -295,7 +312,8 @@ impl<'w> Tracer<'_, 'w> {
             let detail = format!("{} says so of its way to {}", hop.flow, describe(&hop.to));
             trace.add(hop.flow, route.step, route.ok, route.code, detail);
         } else if own_layer && receiver.is_some() {
-            let detail = format!("{} carries it for the layer and has told nothing of it", hop.flow);
+            let detail =
+                format!("{} carries it for the layer and has told nothing of it", hop.flow);
             trace.fail(self.view.me, StepKind::Plan, WhyCode::NotOwner, detail);
         }
         self.link(trace, hop);
@@ -319,11 +337,8 @@ impl<'w> Tracer<'_, 'w> {
             .any(|planned| (planned.from, &planned.to) == (hop.from, &hop.to));
         // What is addressed to a flow is delivered even where it did not expect to be chosen.
         let unplanned = hop.from == Scope::Inter && !planned;
-        let facts = self
-            .input
-            .bridges
-            .iter()
-            .find(|facts| (facts.from, &facts.to) == (hop.from, &hop.to));
+        let facts =
+            self.input.bridges.iter().find(|facts| (facts.from, &facts.to) == (hop.from, &hop.to));
         match facts.map(|facts| &facts.state) {
             Some(BridgeState::Failed(detail)) => {
                 return trace.fail(flow, bridge, WhyCode::BridgeFailed, format!("{way}: {detail}"));
@@ -355,12 +370,14 @@ impl<'w> Tracer<'_, 'w> {
         }
     }
 
-    /// Why this flow makes no bridge for a hop over the layer scope, if its broker cannot have the topic.
+    /// Why this flow makes no bridge for a hop over the layer scope, if its broker cannot have the
+    /// topic.
     fn blocked(&self, hop: &Hop<'w>) -> Option<&Blocked> {
         let on_layer = hop.from == Scope::Layer || hop.to == Target::Layer;
         let of_layer = |blocked: &&Blocked| {
             let layer = Destination::Layer(self.view.me.layer.clone());
-            let of_name = matches!(blocked.code, WhyCode::NameCollision | WhyCode::NameNotExpressible);
+            let of_name =
+                matches!(blocked.code, WhyCode::NameCollision | WhyCode::NameNotExpressible);
             blocked.to == layer && of_name
         };
         self.input.plan.blocked.iter().filter(|_| on_layer).find(of_layer)
@@ -373,12 +390,8 @@ impl<'w> Tracer<'_, 'w> {
         };
         // Of the two ends one may be this flow, which knows that it lives.
         let peer = if receiver == self.view.me { hop.flow } else { receiver };
-        let suspect = self
-            .input
-            .world
-            .flows
-            .get(peer)
-            .is_some_and(|view| view.reach == Reach::Suspect);
+        let suspect =
+            self.input.world.flows.get(peer).is_some_and(|view| view.reach == Reach::Suspect);
         if suspect {
             let detail = format!("{peer} has not answered for a moment");
             trace.fail(hop.flow, StepKind::Link, WhyCode::PeerSuspect, detail);
@@ -400,26 +413,23 @@ impl<'w> Tracer<'_, 'w> {
 pub(super) fn fault(broker: &BrokerFacts) -> Option<(WhyCode, String)> {
     let BrokerFacts { name, detail, .. } = broker;
     let because = |what: String| {
-        if detail.is_empty() {
-            what
-        } else {
-            format!("{what}: {detail}")
-        }
+        if detail.is_empty() { what } else { format!("{what}: {detail}") }
     };
     match broker.health {
         BrokerHealth::Up => None,
-        BrokerHealth::Down => Some((WhyCode::BrokerDown, because(format!("{name} does not answer")))),
-        BrokerHealth::InUse => Some((WhyCode::ScopeInUse, because(format!("another flow uses this {name}")))),
+        BrokerHealth::Down => {
+            Some((WhyCode::BrokerDown, because(format!("{name} does not answer"))))
+        }
+        BrokerHealth::InUse => {
+            Some((WhyCode::ScopeInUse, because(format!("another flow uses this {name}"))))
+        }
     }
 }
 
 /// Drops that explain why messages are missing: all of them failed, or some.
 fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
-    let last = if matches!(hop.to, Target::Inter { .. }) {
-        StepKind::Link
-    } else {
-        StepKind::Deliver
-    };
+    let last =
+        if matches!(hop.to, Target::Inter { .. }) { StepKind::Link } else { StepKind::Deliver };
     let none_passed = facts.sent == 0;
     let mut found = Vec::new();
     if facts.denied > 0 {
@@ -457,11 +467,7 @@ fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
         } else {
             ""
         };
-        found.push((
-            step,
-            code,
-            format!("{count} dropped ({reason}), {}{excess}", counts(facts)),
-        ));
+        found.push((step, code, format!("{count} dropped ({reason}), {}{excess}", counts(facts))));
     }
     found.sort();
     for (step, code, detail) in found {
@@ -483,12 +489,8 @@ pub(super) fn describe(target: &Target) -> String {
 }
 
 fn advertised(publisher: &Publisher<'_>) -> String {
-    let mut services: Vec<&str> = publisher
-        .advertise
-        .sources
-        .iter()
-        .map(|source| source.service.as_str())
-        .collect();
+    let mut services: Vec<&str> =
+        publisher.advertise.sources.iter().map(|source| source.service.as_str()).collect();
     services.dedup();
     services.truncate(4);
     format!("{} on {} scope", services.join(", "), publisher.scope)

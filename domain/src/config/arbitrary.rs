@@ -26,7 +26,8 @@ fn tree(leaf: BoxedStrategy<Value>) -> impl Strategy<Value = Value> {
     leaf.prop_recursive(4, 48, 5, |inner| {
         prop_oneof![
             1 => prop::collection::vec(inner.clone(), 0..4).prop_map(Value::from),
-            4 => prop::collection::btree_map(name(), inner, 0..5).prop_map(|members| members.into_iter().collect()),
+            4 => prop::collection::btree_map(name(), inner, 0..5)
+                .prop_map(|members| members.into_iter().collect()),
         ]
     })
 }
@@ -43,8 +44,10 @@ pub(super) fn any_patch() -> impl Strategy<Value = Value> {
 
 /// An object with `null`s and secrets here and there: a part of a configuration.
 pub(super) fn any_part() -> impl Strategy<Value = Value> {
-    let secret =
-        (0_u64..3).prop_map(|version| serde_json::json!({ "$secret": { "redacted": true, "version": version } }));
+    let secret = (0_u64..3).prop_map(
+        |version| serde_json::json!({ "$secret": { "redacted": true, "version": version } }),
+    );
     let leaf = prop_oneof![6 => leaf(), 3 => Just(Value::Null), 1 => secret].boxed();
-    prop::collection::btree_map(name(), tree(leaf), 0..5).prop_map(|members| members.into_iter().collect())
+    prop::collection::btree_map(name(), tree(leaf), 0..5)
+        .prop_map(|members| members.into_iter().collect())
 }

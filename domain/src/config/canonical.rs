@@ -1,8 +1,8 @@
 //! One text per value: JCS (RFC 8785), and hashes over it.
 //!
-//! Members are ordered by the UTF-16 units of their names, numbers are written as ECMAScript does, nothing is between the
-//! tokens. All numbers are those of IEEE 754; integers within ±(2^53 - 1), the only ones that are taken
-//! ([`json`](super::json)), are exact.
+//! Members are ordered by the UTF-16 units of their names, numbers are written as ECMAScript does,
+//! nothing is between the tokens. All numbers are those of IEEE 754; integers within ±(2^53 - 1),
+//! the only ones that are taken ([`json`](super::json)), are exact.
 
 use serde_json::{Number, Value};
 use sha2::{Digest as _, Sha256};
@@ -17,17 +17,19 @@ pub fn to_string(value: &Value) -> String {
     out
 }
 
-/// `sha256:` and the hash of a configuration in hex, of each secret the version alone. It does not matter in which form
-/// the secrets are.
+/// `sha256:` and the hash of a configuration in hex, of each secret the version alone. It does not
+/// matter in which form the secrets are.
 #[must_use]
 pub fn hash(config: &Value) -> String {
     sha256(to_string(&secret::for_hash(config)).as_bytes())
 }
 
-/// `sha256:` and the hash in hex over one line per document, sorted: what a layer's worker and the main service compare.
-/// Each entry is kind, service (of an instance), name and revision.
+/// `sha256:` and the hash in hex over one line per document, sorted: what a layer's worker and the
+/// main service compare. Each entry is kind, service (of an instance), name and revision.
 #[must_use]
-pub fn digest<'a>(entries: impl IntoIterator<Item = (Kind, Option<&'a str>, &'a str, u64)>) -> String {
+pub fn digest<'a>(
+    entries: impl IntoIterator<Item = (Kind, Option<&'a str>, &'a str, u64)>,
+) -> String {
     let line = |(kind, service, name, revision): (Kind, Option<&str>, &str, u64)| {
         format!("{kind} {} {name} {revision}\n", service.unwrap_or("-"))
     };
@@ -59,7 +61,9 @@ fn write_value(value: &Value, out: &mut String) {
         }
         Value::Object(members) => {
             let mut members: Vec<(&String, &Value)> = members.iter().collect();
-            members.sort_unstable_by(|(one, _), (other, _)| one.encode_utf16().cmp(other.encode_utf16()));
+            members.sort_unstable_by(|(one, _), (other, _)| {
+                one.encode_utf16().cmp(other.encode_utf16())
+            });
             out.push('{');
             for (index, (name, member)) in members.into_iter().enumerate() {
                 if index > 0 {
@@ -75,16 +79,14 @@ fn write_value(value: &Value, out: &mut String) {
 }
 
 fn write_number(number: &Number, out: &mut String) {
-    match number
-        .as_i64()
-        .filter(|value| value.unsigned_abs() <= MAX_INTEGER.unsigned_abs())
-    {
+    match number.as_i64().filter(|value| value.unsigned_abs() <= MAX_INTEGER.unsigned_abs()) {
         Some(value) => out.push_str(&value.to_string()),
         None => write_float(number.as_f64().unwrap_or_default(), out),
     }
 }
 
-/// `Number::toString` of ECMAScript. What is not finite is no number of JSON and becomes `null`, as there.
+/// `Number::toString` of ECMAScript. What is not finite is no number of JSON and becomes `null`, as
+/// there.
 fn write_float(value: f64, out: &mut String) {
     let Some(number) = Number::from_f64(value.abs()) else {
         return out.push_str("null");
@@ -95,8 +97,9 @@ fn write_float(value: f64, out: &mut String) {
     if value < 0.0 {
         out.push('-');
     }
-    // The shortest digits that read back as the same number, nearest to it, of two that are equally near the even ones: so
-    // ECMAScript wants them and so they are printed here. `{:e}` rounds up instead.
+    // The shortest digits that read back as the same number, nearest to it, of two that are equally
+    // near the even ones: so ECMAScript wants them and so they are printed here. `{:e}` rounds up
+    // instead.
     let (digits, exponent) = digits_of(&number.to_string());
     // Where the point stands, counted in digits from the left.
     let point = exponent + 1;
@@ -128,7 +131,8 @@ fn write_float(value: f64, out: &mut String) {
     }
 }
 
-/// The digits of a decimal above zero, without zeros at the ends, and the power of ten of the first.
+/// The digits of a decimal above zero, without zeros at the ends, and the power of ten of the
+/// first.
 fn digits_of(text: &str) -> (String, i32) {
     let (mantissa, power) = text.split_once(['e', 'E']).unwrap_or((text, "0"));
     let (whole, fraction) = mantissa.split_once('.').unwrap_or((mantissa, ""));
@@ -136,7 +140,8 @@ fn digits_of(text: &str) -> (String, i32) {
     let leading = all.len() - all.trim_start_matches('0').len();
     let digits = all.trim_matches('0').to_owned();
     let shift = |length: usize| i32::try_from(length).unwrap_or(i32::MAX);
-    let exponent = power.parse::<i32>().unwrap_or_default() + shift(whole.len()) - 1 - shift(leading);
+    let exponent =
+        power.parse::<i32>().unwrap_or_default() + shift(whole.len()) - 1 - shift(leading);
     (if digits.is_empty() { "0".to_owned() } else { digits }, exponent)
 }
 
@@ -208,8 +213,10 @@ mod tests {
     fn names_are_ordered_by_utf_16() {
         // Section 3.2.3: by code points the emoji would come last.
         let value = json!({
-            "\u{20ac}": "Euro Sign", "\r": "Carriage Return", "\u{fb33}": "Hebrew Letter Dalet With Dagesh",
-            "1": "One", "\u{1f600}": "Emoji: Grinning Face", "\u{80}": "Control", "\u{f6}": "Latin Small Letter O",
+            "\u{20ac}": "Euro Sign", "\r": "Carriage Return", "\u{fb33}": "Hebrew Letter Dalet \
+                With Dagesh",
+            "1": "One", "\u{1f600}": "Emoji: Grinning Face", "\u{80}": "Control",
+            "\u{f6}": "Latin Small Letter O",
         });
         assert_eq!(
             to_string(&value),
@@ -245,7 +252,8 @@ mod tests {
 
     #[test]
     fn the_hash_covers_versions_of_secrets() {
-        let stored = json!({ "pw": { "$secret": { "key": "e1", "nonce": "n", "data": "d", "version": 7 } } });
+        let stored = json!({ "pw": { "$secret": { "key": "e1", "nonce": "n", "data": "d",
+            "version": 7 } } });
         let redacted = json!({ "pw": { "$secret": { "redacted": true, "version": 7 } } });
         assert_eq!(hash(&stored), hash(&redacted));
         assert_eq!(hash(&stored), hash(&secret::for_hash(&stored)));

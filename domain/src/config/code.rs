@@ -1,4 +1,5 @@
-//! The error codes of the configuration's interfaces: one table for REST, gRPC and the pages of the documentation.
+//! The error codes of the configuration's interfaces: one table for REST, gRPC and the pages of the
+//! documentation.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,7 +7,8 @@ use std::str::FromStr;
 use serde::{Serialize, Serializer};
 
 macro_rules! codes {
-    ($($(#[$doc:meta])* $variant:ident = $text:literal, $http:literal, $grpc:literal, $title:literal;)+) => {
+    ($($(#[$doc:meta])* $variant:ident = $text:literal, $http:literal, $grpc:literal,
+        $title:literal;)+) => {
         /// What went wrong, as a closed set.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
         pub enum Code {
@@ -34,7 +36,8 @@ macro_rules! codes {
                 (status > 0).then_some(status)
             }
 
-            /// Number of the status of gRPC (0 to 16). A code that REST alone has gets the one nearest in meaning.
+            /// Number of the status of gRPC (0 to 16). A code that REST alone has gets the one
+            /// nearest in meaning.
             #[must_use]
             pub fn grpc_status(self) -> i32 {
                 match self { $(Self::$variant => $grpc),+ }
@@ -65,7 +68,8 @@ codes! {
     RevisionConflict = "revision_conflict", 409, 10, "It was changed in between.";
     RolloutActive = "rollout_active", 409, 9, "The target has a roll-out already.";
     RolloutState = "rollout_state", 409, 9, "The roll-out is not in a phase that allows this.";
-    IdempotencyInProgress = "idempotency_in_progress", 409, 10, "The first request with this key is still running.";
+    IdempotencyInProgress = "idempotency_in_progress", 409, 10, "The first request with this key \
+        is still running.";
     SigningDisabled = "signing_disabled", 409, 9, "The service has no key to sign tokens with.";
     LimitExceeded = "limit_exceeded", 409, 8, "A limit of the system is reached.";
     RevisionTrimmed = "revision_trimmed", 410, 11, "The history does not reach back that far.";
@@ -73,13 +77,18 @@ codes! {
     PreconditionFailed = "precondition_failed", 412, 10, "The document has another revision.";
     PayloadTooLarge = "payload_too_large", 413, 8, "The body is too large.";
     UriTooLong = "uri_too_long", 414, 3, "The path and query are too long.";
-    UnsupportedMediaType = "unsupported_media_type", 415, 3, "The body's type is not one that is taken here.";
+    UnsupportedMediaType = "unsupported_media_type", 415, 3, "The body's type is not one that is \
+        taken here.";
     ValidationFailed = "validation_failed", 422, 3, "The document breaks a rule.";
-    SchemaMismatch = "schema_mismatch", 422, 3, "An effective configuration would not match its service's schema.";
-    ReferenceNotFound = "reference_not_found", 422, 3, "A document that is referred to does not exist.";
+    SchemaMismatch = "schema_mismatch", 422, 3, "An effective configuration would not match its \
+        service's schema.";
+    ReferenceNotFound = "reference_not_found", 422, 3, "A document that is referred to does not \
+        exist.";
     SecretUnknown = "secret_unknown", 422, 3, "There is no stored secret to keep.";
-    IdempotencyKeyReused = "idempotency_key_reused", 422, 3, "The key was used for another request.";
-    PreconditionRequired = "precondition_required", 428, 9, "The change must say which revision it is of.";
+    IdempotencyKeyReused = "idempotency_key_reused", 422, 3, "The key was used for another \
+        request.";
+    PreconditionRequired = "precondition_required", 428, 9, "The change must say which revision it \
+        is of.";
     RateLimited = "rate_limited", 429, 8, "Too many requests.";
     HeadersTooLarge = "headers_too_large", 431, 8, "The headers are too large.";
     WatchTooSlow = "watch_too_slow", 0, 10, "The watcher fell too far behind.";

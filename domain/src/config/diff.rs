@@ -1,7 +1,8 @@
 //! What differs between two values or documents.
 //!
-//! Objects are compared member by member, everything else as a whole; a secret ([`secret`]) is one value. A difference
-//! is an operation of RFC 6902 at a pointer of RFC 6901: an object that is new is one `add`, not one per member.
+//! Objects are compared member by member, everything else as a whole; a secret ([`secret`]) is one
+//! value. A difference is an operation of RFC 6902 at a pointer of RFC 6901: an object that is new
+//! is one `add`, not one per member.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -12,7 +13,8 @@ use serde_json::{Map, Value, json};
 use super::json::append;
 use super::{Document, Labels, secret};
 
-/// Differences that are told one by one. Beyond, whole objects are told instead of what differs in them.
+/// Differences that are told one by one. Beyond, whole objects are told instead of what differs in
+/// them.
 const MAX_DELTAS: usize = 10_000;
 /// Paths of differences are told in so many bytes, with the same way out.
 const MAX_DELTA_PATH_BYTES: usize = 1024 * 1024;
@@ -45,15 +47,11 @@ impl Delta {
             (Some(_), None) => "remove",
             (Some(_), Some(_)) => "replace",
         };
-        Self {
-            op,
-            path: path.to_owned(),
-            old: old.cloned(),
-            value: value.cloned(),
-        }
+        Self { op, path: path.to_owned(), old: old.cloned(), value: value.cloned() }
     }
 
-    /// The members of the contract; `old` and `value` as far as they are there, for `null` is a value.
+    /// The members of the contract; `old` and `value` as far as they are there, for `null` is a
+    /// value.
     #[must_use]
     pub fn to_json(&self) -> Value {
         json!(self)
@@ -68,14 +66,16 @@ impl Delta {
     }
 }
 
-/// What leads from one value to another, in the order of the paths, each of which begins with `prefix`.
+/// What leads from one value to another, in the order of the paths, each of which begins with
+/// `prefix`.
 #[must_use]
 pub fn diff(old: &Value, new: &Value, prefix: &str) -> Vec<Delta> {
     within_limits(|found| found.values(Some(old), Some(new), &mut prefix.to_owned()))
 }
 
-/// What leads from one document to another, over labels, annotations and spec. No document is one without any members;
-/// absent `spec.config` and `spec.overrides` are `{}`. Secrets are redacted, in whatever form they are.
+/// What leads from one document to another, over labels, annotations and spec. No document is one
+/// without any members; absent `spec.config` and `spec.overrides` are `{}`. Secrets are redacted,
+/// in whatever form they are.
 #[must_use]
 pub fn document_diff(old: Option<&Document>, new: Option<&Document>) -> Vec<Delta> {
     let (old_spec, new_spec) = (redacted_spec(old), redacted_spec(new));
@@ -89,7 +89,9 @@ pub fn document_diff(old: Option<&Document>, new: Option<&Document>) -> Vec<Delt
         }
         let pointer = &mut "/spec".to_owned();
         match (&*old_spec, &*new_spec) {
-            (Value::Object(old), Value::Object(new)) => found.members(old, new, &EMPTY_IF_ABSENT, pointer),
+            (Value::Object(old), Value::Object(new)) => {
+                found.members(old, new, &EMPTY_IF_ABSENT, pointer)
+            }
             (old, new) => found.values(Some(old), Some(new), pointer),
         }
     })
@@ -114,12 +116,16 @@ fn redacted_spec(document: Option<&Document>) -> Cow<'_, Value> {
     }
 }
 
-/// The paths of differences, sorted. If they are too many or too long, they are cut to as many segments as fit.
+/// The paths of differences, sorted. If they are too many or too long, they are cut to as many
+/// segments as fit.
 #[must_use]
 pub fn paths(deltas: &[Delta]) -> Vec<String> {
     let mut out: BTreeSet<&str> = deltas.iter().map(|delta| delta.path.as_str()).collect();
     let mut segments = out.iter().map(|path| path.matches('/').count()).max().unwrap_or(0);
-    while segments > 1 && (out.len() > MAX_PATHS || out.iter().map(|path| path.len()).sum::<usize>() > MAX_PATH_BYTES) {
+    while segments > 1
+        && (out.len() > MAX_PATHS
+            || out.iter().map(|path| path.len()).sum::<usize>() > MAX_PATH_BYTES)
+    {
         segments -= 1;
         out = out.into_iter().map(|path| beginning(path, segments)).collect();
     }
@@ -128,9 +134,7 @@ pub fn paths(deltas: &[Delta]) -> Vec<String> {
 
 /// The first segments of a pointer.
 fn beginning(path: &str, segments: usize) -> &str {
-    path.match_indices('/')
-        .nth(segments)
-        .map_or(path, |(end, _)| &path[..end])
+    path.match_indices('/').nth(segments).map_or(path, |(end, _)| &path[..end])
 }
 
 /// There are too many differences to tell them so far down.
@@ -146,11 +150,7 @@ struct Found {
 /// Tries with all levels of objects, then with fewer and fewer.
 fn within_limits(search: impl Fn(&mut Found) -> Result<(), TooMany>) -> Vec<Delta> {
     for levels in [usize::MAX, 8, 4, 3, 2, 1, 0] {
-        let mut found = Found {
-            deltas: Vec::new(),
-            path_bytes: 0,
-            levels,
-        };
+        let mut found = Found { deltas: Vec::new(), path_bytes: 0, levels };
         if search(&mut found).is_ok() || levels == 0 {
             found.deltas.sort_by(|one, other| one.path.cmp(&other.path));
             return found.deltas;
@@ -169,7 +169,12 @@ impl Found {
         Ok(())
     }
 
-    fn values(&mut self, old: Option<&Value>, new: Option<&Value>, pointer: &mut String) -> Result<(), TooMany> {
+    fn values(
+        &mut self,
+        old: Option<&Value>,
+        new: Option<&Value>,
+        pointer: &mut String,
+    ) -> Result<(), TooMany> {
         if old == new {
             return Ok(());
         }
@@ -193,10 +198,8 @@ impl Found {
         self.levels = self.levels.saturating_sub(1);
         for name in old.keys().chain(added) {
             let length = append(pointer, name);
-            let (old, new) = (
-                old.get(name).or_else(|| default(name)),
-                new.get(name).or_else(|| default(name)),
-            );
+            let (old, new) =
+                (old.get(name).or_else(|| default(name)), new.get(name).or_else(|| default(name)));
             self.values(old, new, pointer)?;
             pointer.truncate(length);
         }
@@ -207,9 +210,7 @@ impl Found {
 
 /// An object that is compared member by member.
 fn plain_object(value: &Value) -> Option<&Map<String, Value>> {
-    value
-        .as_object()
-        .filter(|members| !members.contains_key(secret::MEMBER))
+    value.as_object().filter(|members| !members.contains_key(secret::MEMBER))
 }
 
 #[cfg(test)]

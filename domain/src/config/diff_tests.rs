@@ -7,13 +7,7 @@ use crate::config::arbitrary::{any_json, any_part};
 fn lines(deltas: &[Delta]) -> Vec<String> {
     let shown = |value: &Option<Value>| value.as_ref().map_or("-".to_owned(), Value::to_string);
     let line = |delta: &Delta| {
-        format!(
-            "{} {} {} {}",
-            delta.op,
-            delta.path,
-            shown(&delta.old),
-            shown(&delta.value)
-        )
+        format!("{} {} {} {}", delta.op, delta.path, shown(&delta.old), shown(&delta.value))
     };
     deltas.iter().map(line).collect()
 }
@@ -21,17 +15,27 @@ fn lines(deltas: &[Delta]) -> Vec<String> {
 fn document(labels: &[(&str, &str)], spec: Value) -> Document {
     let pairs = labels.iter();
     Document {
-        labels: pairs
-            .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-            .collect(),
+        labels: pairs.map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect(),
         ..Document::new("Layer/edge".parse().unwrap(), spec)
     }
 }
 
 #[test]
 fn objects_are_descended_and_the_rest_is_whole() {
-    let old = json!({ "b": { "x": 1, "y": { "z": 2 } }, "a": [1, 2], "gone": { "p": 1 }, "same": {}, "n": null });
-    let new = json!({ "b": { "x": 1, "y": { "z": 3 } }, "a": [1, 3], "new/er": { "q": 1 }, "same": {}, "n": 0 });
+    let old = json!({
+        "b": { "x": 1, "y": { "z": 2 } },
+        "a": [1, 2],
+        "gone": { "p": 1 },
+        "same": {},
+        "n": null,
+    });
+    let new = json!({
+        "b": { "x": 1, "y": { "z": 3 } },
+        "a": [1, 3],
+        "new/er": { "q": 1 },
+        "same": {},
+        "n": 0,
+    });
     assert_eq!(
         lines(&diff(&old, &new, "/spec/config")),
         [
@@ -42,10 +46,7 @@ fn objects_are_descended_and_the_rest_is_whole() {
             "add /spec/config/new~1er - {\"q\":1}",
         ]
     );
-    assert_eq!(
-        lines(&diff(&json!(1), &json!({ "a": 1 }), "")),
-        ["replace  1 {\"a\":1}"]
-    );
+    assert_eq!(lines(&diff(&json!(1), &json!({ "a": 1 }), "")), ["replace  1 {\"a\":1}"]);
     assert!(diff(&old, &old, "").is_empty());
 }
 
@@ -88,17 +89,16 @@ fn secrets_are_redacted_and_compared_by_version() {
     let with = |version: u64, data: &str| {
         document(
             &[],
-            json!({ "config": { "pw": { "$secret": { "key": "e1", "nonce": data, "data": data, "version": version } } } }),
+            json!({ "config": { "pw": { "$secret": { "key": "e1", "nonce": data, "data": data,
+                "version": version } } } }),
         )
     };
     assert!(document_diff(Some(&with(3, "one")), Some(&with(3, "two"))).is_empty());
     let deltas = document_diff(Some(&with(3, "one")), Some(&with(4, "two")));
     assert_eq!(
         lines(&deltas),
-        [
-            "replace /spec/config/pw {\"$secret\":{\"redacted\":true,\"version\":3}} \
-          {\"$secret\":{\"redacted\":true,\"version\":4}}"
-        ]
+        ["replace /spec/config/pw {\"$secret\":{\"redacted\":true,\"version\":3}} \
+          {\"$secret\":{\"redacted\":true,\"version\":4}}"]
     );
     let text = document(&[], json!({ "config": { "list": [{ "$secret": "canary" }] } }));
     assert!(!lines(&document_diff(None, Some(&text))).concat().contains("canary"));
@@ -106,11 +106,9 @@ fn secrets_are_redacted_and_compared_by_version() {
 
 #[test]
 fn a_difference_survives_its_json() {
-    for delta in diff(
-        &json!({ "a": null, "b": 1, "c": 2 }),
-        &json!({ "a": 1, "b": null, "d": null }),
-        "",
-    ) {
+    for delta in
+        diff(&json!({ "a": null, "b": 1, "c": 2 }), &json!({ "a": 1, "b": null, "d": null }), "")
+    {
         assert_eq!(Delta::from_json(&delta.to_json()), Some(delta.clone()), "{delta:?}");
     }
     assert_eq!(
@@ -139,33 +137,25 @@ fn too_many_differences_are_told_by_whole_objects() {
         ["/spec/config/a/b/c", "/spec/config/x"]
     );
     let deep = |value: usize| {
-        let inner: Value = (0..300)
-            .map(|index| (format!("k{index}"), Value::from(value)))
-            .collect();
+        let inner: Value =
+            (0..300).map(|index| (format!("k{index}"), Value::from(value))).collect();
         json!({ "a": { ("k".repeat(5000)): inner } })
     };
-    assert_eq!(
-        paths(&diff(&deep(0), &deep(1), "")),
-        [format!("/a/{}", "k".repeat(5000))]
-    );
+    assert_eq!(paths(&diff(&deep(0), &deep(1), "")), [format!("/a/{}", "k".repeat(5000))]);
 }
 
 #[test]
 fn paths_are_cut_to_what_fits() {
     let delta = |path: String| Delta::new(&path, None, Some(&json!(1)));
-    let few: Vec<Delta> = ["/b/c", "/a", "/b/c"]
-        .into_iter()
-        .map(|path| delta(path.to_owned()))
-        .collect();
+    let few: Vec<Delta> =
+        ["/b/c", "/a", "/b/c"].into_iter().map(|path| delta(path.to_owned())).collect();
     assert_eq!(paths(&few), ["/a", "/b/c"]);
-    let many: Vec<Delta> = (0..=MAX_PATHS)
-        .map(|index| delta(format!("/spec/config/{}/{index}", index % 7)))
-        .collect();
+    let many: Vec<Delta> =
+        (0..=MAX_PATHS).map(|index| delta(format!("/spec/config/{}/{index}", index % 7))).collect();
     let expected: Vec<String> = (0..7).map(|index| format!("/spec/config/{index}")).collect();
     assert_eq!(paths(&many), expected);
-    let long: Vec<Delta> = (0..100)
-        .map(|index| delta(format!("/spec/{}/{index}", "x".repeat(1000))))
-        .collect();
+    let long: Vec<Delta> =
+        (0..100).map(|index| delta(format!("/spec/{}/{index}", "x".repeat(1000)))).collect();
     assert_eq!(paths(&long), [format!("/spec/{}", "x".repeat(1000))]);
     assert!(paths(&[]).is_empty());
 }

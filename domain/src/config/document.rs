@@ -10,8 +10,8 @@ use super::{Key, Kind, Timestamp};
 /// Labels or annotations, in the order of their keys.
 pub type Labels = BTreeMap<String, String>;
 
-/// A document as the store has it. Secrets in `spec` may be there in any of their three forms ([`super::secret`]):
-/// encrypted in the store, redacted towards users, as text in `Sync` alone.
+/// A document as the store has it. Secrets in `spec` may be there in any of their three forms
+/// ([`super::secret`]): encrypted in the store, redacted towards users, as text in `Sync` alone.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Document {
     /// Kind and name.
@@ -120,10 +120,9 @@ impl Document {
     #[must_use]
     pub fn overrides(&self, service: &str) -> Option<&Value> {
         match self.key.kind() {
-            Kind::Layer | Kind::Node => self
-                .spec_member("overrides")?
-                .get(service)
-                .filter(|value| !value.is_null()),
+            Kind::Layer | Kind::Node => {
+                self.spec_member("overrides")?.get(service).filter(|value| !value.is_null())
+            }
             Kind::Service | Kind::Instance | Kind::Rollout => None,
         }
     }
@@ -132,7 +131,9 @@ impl Document {
     #[must_use]
     pub fn is_for_layer(&self, layer: &str) -> bool {
         match (self.key.kind(), self.spec_member("layers").and_then(Value::as_array)) {
-            (Kind::Service, Some(layers)) => layers.iter().any(|value| value.as_str() == Some(layer)),
+            (Kind::Service, Some(layers)) => {
+                layers.iter().any(|value| value.as_str() == Some(layer))
+            }
             _ => true,
         }
     }

@@ -48,8 +48,8 @@ impl Sources {
         Self::at_where(state, at, |_| true)
     }
 
-    /// The same with those roll-outs alone that `counts` lets pass: a worker undoes one that failed on its node before the
-    /// main service knows.
+    /// The same with those roll-outs alone that `counts` lets pass: a worker undoes one that failed
+    /// on its node before the main service knows.
     #[must_use]
     pub fn at_where(state: &State, at: &At, counts: impl Fn(&Document) -> bool) -> Self {
         let document = |key: Key| state.get(&key).map(|held| Arc::clone(&held.document));
@@ -58,7 +58,9 @@ impl Sources {
             layer: at.layer.as_ref().and_then(|name| document(Key::layer(name))),
             node: at.node.as_ref().and_then(|name| document(Key::node(name))),
             instance: match (&at.service, &at.instance) {
-                (Some(service), Some(instance)) => document(Key::instance(service.clone(), instance.clone())),
+                (Some(service), Some(instance)) => {
+                    document(Key::instance(service.clone(), instance.clone()))
+                }
                 _ => None,
             },
             rollout: None,
@@ -116,7 +118,9 @@ impl Sources {
             if let Some(config) = document.config() {
                 out.push((&**document, false, config));
             }
-            if with_overrides && let Some(config) = service.and_then(|service| document.overrides(service)) {
+            if with_overrides
+                && let Some(config) = service.and_then(|service| document.overrides(service))
+            {
                 out.push((&**document, true, config));
             }
         }
@@ -146,11 +150,8 @@ impl Sources {
     /// Where each key comes from.
     #[must_use]
     pub fn explain(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
-        let values: Vec<Value> = self
-            .parts()
-            .iter()
-            .map(|(document, _, value)| form(document, value))
-            .collect();
+        let values: Vec<Value> =
+            self.parts().iter().map(|(document, _, value)| form(document, value)).collect();
         let parts: Vec<Part<'_>> = self
             .parts()
             .iter()
@@ -193,8 +194,8 @@ pub fn canaries(rollout: &Document) -> Option<LabelSelector> {
     canary.get("node_selector")?.as_str()?.parse().ok()
 }
 
-/// A document with a roll-out's change in its spec. Secrets of the change were encrypted for the roll-out, so they are
-/// not carried over here: a roll-out may not change secrets.
+/// A document with a roll-out's change in its spec. Secrets of the change were encrypted for the
+/// roll-out, so they are not carried over here: a roll-out may not change secrets.
 #[must_use]
 pub fn patched(document: &Document, patch: &Value) -> Document {
     let mut out = document.clone();

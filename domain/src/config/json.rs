@@ -5,7 +5,8 @@
 //! Value ──[check]──▶ ()               finite, nesting deeper than 32, text after the value, bytes that are not UTF-8
 //! ```
 //!
-//! A float beyond ±(2^53 - 1) is whole, so it counts as an integer: `1e300` is refused as `10000000000000000` is.
+//! A float beyond ±(2^53 - 1) is whole, so it counts as an integer: `1e300` is refused as
+//! `10000000000000000` is.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -61,20 +62,15 @@ pub fn parse(bytes: &[u8]) -> Result<Value, JsonFault> {
 /// # Errors
 /// The first fault, with its place.
 pub fn parse_within(bytes: &[u8], max_depth: usize) -> Result<Value, JsonFault> {
-    let mut reading = Reading {
-        path: Vec::new(),
-        max_depth,
-        refused: None,
-    };
+    let mut reading = Reading { path: Vec::new(), max_depth, refused: None };
     let mut source = serde_json::Deserializer::from_slice(bytes);
     let read = Seed(&mut reading).deserialize(&mut source);
-    read.and_then(|value| source.end().map(|()| value))
-        .map_err(|error| JsonFault {
-            pointer: shown(&pointer_of(&reading.path)),
-            line: error.line(),
-            column: error.column(),
-            detail: reading.refused.take().unwrap_or_else(|| without_place(&error)),
-        })
+    read.and_then(|value| source.end().map(|()| value)).map_err(|error| JsonFault {
+        pointer: shown(&pointer_of(&reading.path)),
+        line: error.line(),
+        column: error.column(),
+        detail: reading.refused.take().unwrap_or_else(|| without_place(&error)),
+    })
 }
 
 /// Checks a value that came from elsewhere (YAML) for the same limits.
@@ -124,7 +120,8 @@ fn check_number(number: &Number) -> Result<(), String> {
     if exact { Ok(()) } else { Err(too_wide()) }
 }
 
-/// How deep objects and arrays are nested: 0 for a scalar. A secret counts as two, as it does once it is redacted.
+/// How deep objects and arrays are nested: 0 for a scalar. A secret counts as two, as it does once
+/// it is redacted.
 #[must_use]
 pub fn depth(value: &Value) -> usize {
     match value {
@@ -181,7 +178,10 @@ fn is_exact(magnitude: u64) -> bool {
 }
 
 fn too_wide() -> String {
-    format!("is an integer outside ±{MAX_INTEGER}, which not every reader holds exactly; write it as text")
+    format!(
+        "is an integer outside ±{MAX_INTEGER}, which not every reader holds exactly; write it as \
+         text"
+    )
 }
 
 fn too_deep(max_depth: usize) -> String {
@@ -269,11 +269,7 @@ impl<'de> Visitor<'de> for Seed<'_> {
     }
 
     fn visit_u64<E: Error>(self, value: u64) -> Result<Value, E> {
-        if is_exact(value) {
-            Ok(value.into())
-        } else {
-            Err(self.0.refuse(too_wide()))
-        }
+        if is_exact(value) { Ok(value.into()) } else { Err(self.0.refuse(too_wide())) }
     }
 
     fn visit_f64<E: Error>(self, value: f64) -> Result<Value, E> {

@@ -12,18 +12,12 @@ fn fault(text: &str) -> String {
 fn what_is_json_is_read() {
     for (text, expected) in [
         ("null", json!(null)),
-        (
-            " [1, -2, 0.5, true, \"\u{e4}\\u0000\"] ",
-            json!([1, -2, 0.5, true, "\u{e4}\u{0}"]),
-        ),
+        (" [1, -2, 0.5, true, \"\u{e4}\\u0000\"] ", json!([1, -2, 0.5, true, "\u{e4}\u{0}"])),
         ("{\"b\":{},\"a\":[]}", json!({ "b": {}, "a": [] })),
         ("9007199254740991", json!(9_007_199_254_740_991_i64)),
         ("-9007199254740991", json!(-9_007_199_254_740_991_i64)),
         ("9007199254740991.0", json!(9_007_199_254_740_991.0)),
-        (
-            "[1e15, \"100000000000000000000\"]",
-            json!([1e15, "100000000000000000000"]),
-        ),
+        ("[1e15, \"100000000000000000000\"]", json!([1e15, "100000000000000000000"])),
         (
             "{\"$serde_json::private::RawValue\":\"1\"}",
             json!({ "$serde_json::private::RawValue": "1" }),
@@ -48,10 +42,7 @@ fn faults_have_line_column_and_pointer() {
     let deep = parse(b"{\"a\":[{\"b/c\":9007199254740992}]}").unwrap_err();
     assert_eq!(deep.pointer, "/a/0/b~1c");
     assert_eq!(deep.line, 1);
-    assert!(
-        deep.detail.starts_with("is an integer outside ±9007199254740991"),
-        "{deep}"
-    );
+    assert!(deep.detail.starts_with("is an integer outside ±9007199254740991"), "{deep}");
     assert_eq!(parse(b"[1,2]]").unwrap_err().detail, "trailing characters");
     assert_eq!(parse(b"{\"a\":[1,}").unwrap_err().pointer, "/a/1");
     assert_eq!(parse(b"").unwrap_err().detail, "EOF while parsing a value");
@@ -134,10 +125,7 @@ fn depth_is_bounded() {
 #[test]
 fn a_secret_is_as_deep_as_it_will_be_shown() {
     assert_eq!(depth(&json!({ "a": { "$secret": "x" } })), 3);
-    assert_eq!(
-        depth(&json!({ "a": { "$secret": { "redacted": true, "version": 3 } } })),
-        3
-    );
+    assert_eq!(depth(&json!({ "a": { "$secret": { "redacted": true, "version": 3 } } })), 3);
     assert_eq!(depth(&json!(5)), 0);
 }
 
@@ -153,10 +141,7 @@ fn values_from_elsewhere_have_the_same_limits() {
         assert_eq!((fault.pointer.as_str(), fault.line), (pointer, 0));
         assert!(fault.detail.contains("integer outside"));
     }
-    assert_eq!(
-        check(&json!({ "a": [1e-300, -0.5, 1e15, 9_007_199_254_740_991_i64] })),
-        Ok(())
-    );
+    assert_eq!(check(&json!({ "a": [1e-300, -0.5, 1e15, 9_007_199_254_740_991_i64] })), Ok(()));
 }
 
 #[test]

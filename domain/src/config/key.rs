@@ -48,7 +48,8 @@ impl Kind {
     }
 }
 
-/// Kind and name of a document; of an instance also its service. Ordered by kind, service, name, bytewise.
+/// Kind and name of a document; of an instance also its service. Ordered by kind, service, name,
+/// bytewise.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Key {
     kind: Kind,
@@ -81,7 +82,11 @@ impl Key {
     ///
     /// # Errors
     /// [`KeyError::NoService`], [`KeyError::Service`].
-    pub fn new(kind: Kind, service: Option<ServiceName>, name: DocumentName) -> Result<Self, KeyError> {
+    pub fn new(
+        kind: Kind,
+        service: Option<ServiceName>,
+        name: DocumentName,
+    ) -> Result<Self, KeyError> {
         match (kind, &service) {
             (Kind::Instance, None) => Err(KeyError::NoService),
             (Kind::Instance, Some(_)) | (_, None) => Ok(Self { kind, service, name }),
@@ -110,11 +115,7 @@ impl Key {
     /// An instance of a service.
     #[must_use]
     pub fn instance(service: ServiceName, name: DocumentName) -> Self {
-        Self {
-            kind: Kind::Instance,
-            service: Some(service),
-            name,
-        }
+        Self { kind: Kind::Instance, service: Some(service), name }
     }
 
     /// A roll-out.
@@ -124,11 +125,7 @@ impl Key {
     }
 
     fn plain(kind: Kind, name: DocumentName) -> Self {
-        Self {
-            kind,
-            service: None,
-            name,
-        }
+        Self { kind, service: None, name }
     }
 
     /// Its kind.
@@ -180,24 +177,14 @@ mod tests {
 
     #[test]
     fn a_key_reads_as_it_is_written() {
-        for text in [
-            "Layer/edge",
-            "Node/robot-1",
-            "Service/slam",
-            "Instance/slam/0",
-            "Rollout/slower",
-        ] {
+        for text in
+            ["Layer/edge", "Node/robot-1", "Service/slam", "Instance/slam/0", "Rollout/slower"]
+        {
             assert_eq!(text.parse::<Key>().unwrap().to_string(), text);
         }
-        for text in [
-            "Layer",
-            "Layer/a/b",
-            "Instance/slam",
-            "layer/a",
-            "Node/A",
-            "Instance/slam/0/1",
-            "",
-        ] {
+        for text in
+            ["Layer", "Layer/a/b", "Instance/slam", "layer/a", "Node/A", "Instance/slam/0/1", ""]
+        {
             assert!(text.parse::<Key>().is_err(), "{text}");
         }
     }

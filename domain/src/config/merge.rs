@@ -1,11 +1,12 @@
-//! Merging: a patch into a value, and the parts of an effective configuration with where each key of it comes from.
+//! Merging: a patch into a value, and the parts of an effective configuration with where each key
+//! of it comes from.
 //!
 //! ```text
 //! {} ◀─ S.config ◀─ L.config ◀─ L.overrides[S] ◀─ N.config ◀─ N.overrides[S] ◀─ I.config      weakest first
 //! ```
 //!
-//! Merging is that of RFC 7396: objects are merged member by member, everything else replaces, `null` removes. A secret
-//! ([`secret`]) is one value and replaces as a text would.
+//! Merging is that of RFC 7396: objects are merged member by member, everything else replaces,
+//! `null` removes. A secret ([`secret`]) is one value and replaces as a text would.
 
 use std::collections::BTreeMap;
 
@@ -39,8 +40,8 @@ impl Source {
     }
 }
 
-/// One part of an effective configuration: an object that is there, even if it is empty. A part that is absent from its
-/// document is left out.
+/// One part of an effective configuration: an object that is there, even if it is empty. A part
+/// that is absent from its document is left out.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Part<'v> {
     /// Where it stands.
@@ -59,7 +60,8 @@ pub fn merge_patch(target: &mut Value, patch: &Value) {
         *target = Value::Object(Map::new());
     }
     let Value::Object(out) = target else { return };
-    // All at once: removing one by one from a map that keeps its order takes time in proportion to both.
+    // All at once: removing one by one from a map that keeps its order takes time in proportion to
+    // both.
     if members.values().any(Value::is_null) {
         out.retain(|name, _| members.get(name).is_none_or(|value| !value.is_null()));
     }
@@ -77,20 +79,21 @@ pub fn merge_patch(target: &mut Value, patch: &Value) {
 
 /// An object that is merged member by member.
 fn plain_object(value: &Value) -> Option<&Map<String, Value>> {
-    value
-        .as_object()
-        .filter(|members| !members.contains_key(secret::MEMBER))
+    value.as_object().filter(|members| !members.contains_key(secret::MEMBER))
 }
 
-/// Where each key of the effective configuration of parts (weakest first) comes from: JSON pointer → source.
+/// Where each key of the effective configuration of parts (weakest first) comes from: JSON pointer
+/// → source.
 ///
-/// There is one entry for each leaf: a value that is no object, or an object without members. It names the strongest part
-/// that says something of that key, and in `overridden` the weaker ones that do, the strongest of them first, each with
-/// its `value`. A key that a `null` took away has an entry with `"removed": true`, as long as something stronger has
-/// not put a value there again. Values are as they stand in the parts: redact secrets before.
+/// There is one entry for each leaf: a value that is no object, or an object without members. It
+/// names the strongest part that says something of that key, and in `overridden` the weaker ones
+/// that do, the strongest of them first, each with its `value`. A key that a `null` took away has
+/// an entry with `"removed": true`, as long as something stronger has not put a value there again.
+/// Values are as they stand in the parts: redact secrets before.
 #[must_use]
 pub fn explain(parts: &[Part<'_>]) -> Value {
-    let parts: Vec<&Part<'_>> = parts.iter().filter(|part| plain_object(part.value).is_some()).collect();
+    let parts: Vec<&Part<'_>> =
+        parts.iter().filter(|part| plain_object(part.value).is_some()).collect();
     let mut trace = None;
     for (index, part) in parts.iter().enumerate() {
         follow(&mut trace, part.value, index);
@@ -107,10 +110,7 @@ pub fn explain(parts: &[Part<'_>]) -> Value {
 enum Trace<'v> {
     Leaf(usize),
     Removed(usize),
-    Object {
-        touched: usize,
-        members: BTreeMap<&'v str, Trace<'v>>,
-    },
+    Object { touched: usize, members: BTreeMap<&'v str, Trace<'v>> },
 }
 
 /// Does to the trace what [`merge_patch`] does to the value.
@@ -135,10 +135,7 @@ fn follow<'v>(trace: &mut Option<Trace<'v>>, value: &'v Value, index: usize) {
             members.extend(member.map(|member| (name.as_str(), member)));
         }
     }
-    *trace = Some(Trace::Object {
-        touched: index,
-        members,
-    });
+    *trace = Some(Trace::Object { touched: index, members });
 }
 
 /// Writes the entries of a key and of everything below it; `here` is what each part says of it.
@@ -157,7 +154,9 @@ fn collect(
             (is_empty.then_some(*touched), false, Some(members))
         }
     };
-    if let Some((source, index)) = strongest.and_then(|index| Some((&parts.get(index)?.source, index))) {
+    if let Some((source, index)) =
+        strongest.and_then(|index| Some((&parts.get(index)?.source, index)))
+    {
         let mut entry = Map::new();
         if removed {
             entry.insert("removed".to_owned(), true.into());

@@ -60,11 +60,7 @@ fn a_secret_is_one_value() {
 }
 
 fn part<'v>(key: &str, revision: u64, value: &'v Value) -> Part<'v> {
-    let source = Source {
-        key: key.parse().unwrap(),
-        revision,
-        is_override: false,
-    };
+    let source = Source { key: key.parse().unwrap(), revision, is_override: false };
     Part { source, value }
 }
 
@@ -72,10 +68,7 @@ fn part<'v>(key: &str, revision: u64, value: &'v Value) -> Part<'v> {
 fn the_example_of_the_contract() {
     let service = json!({ "camera": { "rate_hz": 30 } });
     let instance = json!({ "camera": { "rate_hz": 10 } });
-    let parts = [
-        part("Service/slam", 3, &service),
-        part("Instance/slam/0", 88, &instance),
-    ];
+    let parts = [part("Service/slam", 3, &service), part("Instance/slam/0", 88, &instance)];
     assert_eq!(effective(&parts), json!({ "camera": { "rate_hz": 10 } }));
     let expected = json!({ "/camera/rate_hz": {
         "kind": "Instance", "service": "slam", "name": "0", "revision": 88,
@@ -88,15 +81,13 @@ fn the_example_of_the_contract() {
 #[test]
 fn overrides_are_marked_and_the_strongest_weaker_part_comes_first() {
     let (one, two, three) = (json!({ "a": 1 }), json!({ "a": [2] }), json!({ "a": 3 }));
-    let mut parts = [
-        part("Service/s", 1, &one),
-        part("Layer/edge", 2, &two),
-        part("Layer/edge", 2, &three),
-    ];
+    let mut parts =
+        [part("Service/s", 1, &one), part("Layer/edge", 2, &two), part("Layer/edge", 2, &three)];
     parts[2].source.is_override = true;
     assert_eq!(
         explain(&parts),
-        json!({ "/a": { "kind": "Layer", "name": "edge", "revision": 2, "override": true, "overridden": [
+        json!({ "/a": { "kind": "Layer", "name": "edge", "revision": 2, "override": true,
+            "overridden": [
             { "kind": "Layer", "name": "edge", "revision": 2, "value": [2] },
             { "kind": "Service", "name": "s", "revision": 1, "value": 1 },
         ] } })
@@ -140,11 +131,8 @@ fn what_is_below_a_removed_key_is_not_told() {
     let service = json!({ "a": { "b": { "c": 1 } } });
     let layer = json!({ "a": { "b": { "c": null } } });
     let node = json!({ "a": null });
-    let parts = [
-        part("Service/s", 1, &service),
-        part("Layer/l", 2, &layer),
-        part("Node/n", 3, &node),
-    ];
+    let parts =
+        [part("Service/s", 1, &service), part("Layer/l", 2, &layer), part("Node/n", 3, &node)];
     let explained = explain(&parts);
     // The whole is an empty object: the last that touched it is told as well.
     let keys: Vec<&String> = explained.as_object().unwrap().keys().collect();
@@ -156,14 +144,13 @@ fn what_is_below_a_removed_key_is_not_told() {
 
 #[test]
 fn a_hundred_thousand_removals_are_quick() {
-    let many: Value = (0..100_000)
-        .map(|index| (index.to_string(), Value::from(index)))
-        .collect();
+    let many: Value = (0..100_000).map(|index| (index.to_string(), Value::from(index))).collect();
     let none: Value = (0..100_000).map(|index| (index.to_string(), Value::Null)).collect();
     assert_eq!(merged(many, &none), json!({}));
 }
 
-/// JSON pointers to the leaves of a value: what is no object, or an object without members. A secret is a leaf.
+/// JSON pointers to the leaves of a value: what is no object, or an object without members. A
+/// secret is a leaf.
 fn leaves(value: &Value) -> Vec<String> {
     let mut out = Vec::new();
     leaves_at(value, "", &mut out);
@@ -172,9 +159,9 @@ fn leaves(value: &Value) -> Vec<String> {
 
 fn leaves_at(value: &Value, pointer: &str, out: &mut Vec<String>) {
     match plain_object(value).filter(|members| !members.is_empty()) {
-        Some(members) => members
-            .iter()
-            .for_each(|(name, member)| leaves_at(member, &push(pointer, name), out)),
+        Some(members) => {
+            members.iter().for_each(|(name, member)| leaves_at(member, &push(pointer, name), out))
+        }
         None => out.push(pointer.to_owned()),
     }
 }
@@ -211,7 +198,8 @@ proptest! {
         let explained = explain(&parts);
         let entries = explained.as_object().unwrap();
         let told: BTreeSet<String> =
-            entries.iter().filter(|(_, entry)| entry.get("removed").is_none()).map(|(key, _)| key.clone()).collect();
+            entries.iter().filter(|(_, entry)| entry.get("removed").is_none())
+                .map(|(key, _)| key.clone()).collect();
         prop_assert_eq!(&told, &leaves(&whole).into_iter().collect::<BTreeSet<_>>());
         for (pointer, entry) in entries {
             let index = entry["revision"].as_u64().unwrap() as usize;

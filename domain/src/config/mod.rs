@@ -1,4 +1,5 @@
-//! The configuration of a whole system as plain data: documents, their merging and comparing, and how they are written.
+//! The configuration of a whole system as plain data: documents, their merging and comparing, and
+//! how they are written.
 //!
 //! ```text
 //! bytes ──[json, yaml]──▶ Value ──[spec]──▶ Document (kind, name, labels, spec) ──[merge]──▶ effective configuration
@@ -6,7 +7,8 @@
 //!                                                   └──[diff]──▶ changes                          └──[canonical]──▶ hash
 //! ```
 //!
-//! The main service and the worker share all of it, so that both come to the same configuration and the same hash.
+//! The main service and the worker share all of it, so that both come to the same configuration and
+//! the same hash.
 
 #[cfg(test)]
 mod arbitrary;

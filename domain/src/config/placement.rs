@@ -29,12 +29,15 @@ impl Visible {
         match (self, other) {
             (Self::Everywhere, other) => other,
             (one, Self::Everywhere) => one,
-            (Self::In(one), Self::In(other)) => Self::In(one.into_iter().filter(|l| other.contains(l)).collect()),
+            (Self::In(one), Self::In(other)) => {
+                Self::In(one.into_iter().filter(|l| other.contains(l)).collect())
+            }
         }
     }
 }
 
-/// Where a document counts at one revision. It may change without the document: an instance moves with its node.
+/// Where a document counts at one revision. It may change without the document: an instance moves
+/// with its node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Placement {
     /// Layers that see it.
@@ -55,11 +58,7 @@ pub fn placement(state: &State, document: &Document) -> Placement {
     match document.key.kind() {
         Kind::Layer => {
             let layer = LayerName::from(document.key.name());
-            Placement {
-                visible: Visible::In(vec![layer.clone()]),
-                layer: Some(layer),
-                node: None,
-            }
+            Placement { visible: Visible::In(vec![layer.clone()]), layer: Some(layer), node: None }
         }
         Kind::Node => {
             let layer: Option<LayerName> = name(document.spec_layer());
@@ -69,29 +68,24 @@ pub fn placement(state: &State, document: &Document) -> Placement {
                 node: Some(NodeName::from(document.key.name())),
             }
         }
-        Kind::Service => Placement {
-            visible: service_layers(document),
-            layer: None,
-            node: None,
-        },
+        Kind::Service => Placement { visible: service_layers(document), layer: None, node: None },
         Kind::Instance => instance(state, document),
         Kind::Rollout => {
             // A roll-out of a roll-out is refused; it would lead in a circle.
             let target = rollout_target(document).filter(|key| key.kind() != Kind::Rollout);
             let target = target.and_then(|key| state.get(&key).cloned());
-            let visible = target.map_or(Visible::In(Vec::new()), |held| placement(state, &held.document).visible);
-            Placement {
-                visible,
-                layer: None,
-                node: None,
-            }
+            let visible = target
+                .map_or(Visible::In(Vec::new()), |held| placement(state, &held.document).visible);
+            Placement { visible, layer: None, node: None }
         }
     }
 }
 
 fn service_layers(service: &Document) -> Visible {
     match service.spec_member("layers").and_then(Value::as_array) {
-        Some(layers) => Visible::In(layers.iter().filter_map(|layer| name(layer.as_str())).collect()),
+        Some(layers) => {
+            Visible::In(layers.iter().filter_map(|layer| name(layer.as_str())).collect())
+        }
         None => Visible::Everywhere,
     }
 }
@@ -99,9 +93,7 @@ fn service_layers(service: &Document) -> Visible {
 fn instance(state: &State, document: &Document) -> Placement {
     let node: Option<NodeName> = name(document.spec_node());
     let layer: Option<LayerName> = match &node {
-        Some(node) => state
-            .get(&Key::node(node))
-            .and_then(|held| name(held.document.spec_layer())),
+        Some(node) => state.get(&Key::node(node)).and_then(|held| name(held.document.spec_layer())),
         None => name(document.spec_layer()),
     };
     let placed = match (&layer, &node) {
@@ -109,16 +101,9 @@ fn instance(state: &State, document: &Document) -> Placement {
         (None, None) => Visible::Everywhere,
         (None, Some(_)) => Visible::In(Vec::new()),
     };
-    let service = document
-        .key
-        .service_name()
-        .and_then(|service| state.get(&Key::service(service)));
+    let service = document.key.service_name().and_then(|service| state.get(&Key::service(service)));
     let seen = service.map_or(Visible::In(Vec::new()), |held| service_layers(&held.document));
-    Placement {
-        visible: placed.intersect(seen),
-        layer,
-        node,
-    }
+    Placement { visible: placed.intersect(seen), layer, node }
 }
 
 /// Digest of what a layer sees.

@@ -37,7 +37,8 @@ pub struct FieldFault {
 pub struct Problem {
     /// What kind.
     pub code: Code,
-    /// What was wrong, where, what to do; never holds a secret, a path of the machine or another subject's data.
+    /// What was wrong, where, what to do; never holds a secret, a path of the machine or another
+    /// subject's data.
     pub detail: String,
     /// Whether a change took effect.
     pub applied: Applied,
@@ -76,9 +77,7 @@ impl Problem {
     /// A refusal with its places; the code and words of the first fault stand for all.
     #[must_use]
     pub fn faults(errors: Vec<FieldFault>) -> Self {
-        let first = errors
-            .first()
-            .map(|fault| (fault.code, told(&fault.pointer, &fault.detail)));
+        let first = errors.first().map(|fault| (fault.code, told(&fault.pointer, &fault.detail)));
         let (code, mut detail) = first.unwrap_or((Code::ValidationFailed, String::new()));
         if errors.len() > 1 {
             detail.push_str(&format!(" (and {} more)", errors.len() - 1));

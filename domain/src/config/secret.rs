@@ -7,8 +7,8 @@
 //! the hash covers    {"$secret":{"version":412}}
 //! ```
 //!
-//! The version is the revision at which the text last changed. An object with the member `$secret` is one value: it is
-//! merged and compared whole, and no other member may stand beside it.
+//! The version is the revision at which the text last changed. An object with the member `$secret`
+//! is one value: it is merged and compared whole, and no other member may stand beside it.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -67,7 +67,8 @@ impl<'a> Secret<'a> {
     /// The secret that a value is; `None` if it is none.
     ///
     /// # Errors
-    /// In words that never repeat a text, if the value has the member `$secret` and is none of the forms.
+    /// In words that never repeat a text, if the value has the member `$secret` and is none of the
+    /// forms.
     #[must_use]
     pub fn of(value: &'a Value) -> Option<Result<Self, String>> {
         let members = value.as_object()?;
@@ -89,11 +90,10 @@ impl<'a> Secret<'a> {
         let text = |name: &str| inner.get(name).and_then(Value::as_str);
         let version = inner.get("version")?.as_u64()?;
         match inner.len() {
-            2 if inner.get("redacted") == Some(&Value::Bool(true)) => Some(Self::Redacted { version }),
-            2 => Some(Self::Revealed {
-                text: text("text")?,
-                version,
-            }),
+            2 if inner.get("redacted") == Some(&Value::Bool(true)) => {
+                Some(Self::Redacted { version })
+            }
+            2 => Some(Self::Revealed { text: text("text")?, version }),
             4 => Some(Self::Stored {
                 key: text("key")?,
                 nonce: text("nonce")?,
@@ -109,7 +109,9 @@ impl<'a> Secret<'a> {
     pub fn version(&self) -> u64 {
         match self {
             Self::Text(_) => 0,
-            Self::Redacted { version } | Self::Revealed { version, .. } | Self::Stored { version, .. } => *version,
+            Self::Redacted { version }
+            | Self::Revealed { version, .. }
+            | Self::Stored { version, .. } => *version,
         }
     }
 
@@ -118,14 +120,15 @@ impl<'a> Secret<'a> {
     pub fn to_json(&self) -> Value {
         match self {
             Self::Text(text) => json!({ MEMBER: text }),
-            Self::Redacted { version } => json!({ MEMBER: { "redacted": true, "version": version } }),
-            Self::Revealed { text, version } => json!({ MEMBER: { "text": text, "version": version } }),
-            Self::Stored {
-                key,
-                nonce,
-                data,
-                version,
-            } => json!({ MEMBER: { "key": key, "nonce": nonce, "data": data, "version": version } }),
+            Self::Redacted { version } => {
+                json!({ MEMBER: { "redacted": true, "version": version } })
+            }
+            Self::Revealed { text, version } => {
+                json!({ MEMBER: { "text": text, "version": version } })
+            }
+            Self::Stored { key, nonce, data, version } => {
+                json!({ MEMBER: { "key": key, "nonce": nonce, "data": data, "version": version } })
+            }
         }
     }
 }
@@ -174,12 +177,17 @@ fn walk_at(value: &Value, pointer: &mut String, visit: &mut impl FnMut(&str, &Va
     }
 }
 
-/// Puts something else in place of every secret of a value; where `change` gives `None`, the secret stays.
+/// Puts something else in place of every secret of a value; where `change` gives `None`, the secret
+/// stays.
 pub fn map(value: &mut Value, change: &mut impl FnMut(&str, &Value) -> Option<Value>) {
     map_at(value, &mut String::new(), change);
 }
 
-fn map_at(value: &mut Value, pointer: &mut String, change: &mut impl FnMut(&str, &Value) -> Option<Value>) {
+fn map_at(
+    value: &mut Value,
+    pointer: &mut String,
+    change: &mut impl FnMut(&str, &Value) -> Option<Value>,
+) {
     if is_secret(value) {
         if let Some(other) = change(pointer, value) {
             *value = other;
@@ -209,21 +217,18 @@ fn map_at(value: &mut Value, pointer: &mut String, change: &mut impl FnMut(&str,
 #[must_use]
 pub fn redact(value: &Value) -> Cow<'_, Value> {
     replaced(value, |secret| {
-        let version = Secret::of(secret)
-            .and_then(Result::ok)
-            .map_or(0, |secret| secret.version());
+        let version = Secret::of(secret).and_then(Result::ok).map_or(0, |secret| secret.version());
         Secret::Redacted { version }.to_json()
     })
 }
 
-/// A value as its hash covers it: of every secret the version alone. Doing it twice changes nothing.
+/// A value as its hash covers it: of every secret the version alone. Doing it twice changes
+/// nothing.
 #[must_use]
 pub fn for_hash(value: &Value) -> Cow<'_, Value> {
     replaced(value, |secret| {
-        let version = secret
-            .get(MEMBER)
-            .and_then(|inner| inner.get("version"))
-            .and_then(Value::as_u64);
+        let version =
+            secret.get(MEMBER).and_then(|inner| inner.get("version")).and_then(Value::as_u64);
         json!({ MEMBER: { "version": version.unwrap_or(0) } })
     })
 }
@@ -259,19 +264,11 @@ mod tests {
             ),
             (
                 json!({ "$secret": { "text": "s3cret", "version": 3 } }),
-                Secret::Revealed {
-                    text: "s3cret",
-                    version: 3,
-                },
+                Secret::Revealed { text: "s3cret", version: 3 },
             ),
             (
                 stored(),
-                Secret::Stored {
-                    key: "e1",
-                    nonce: "bm9uY2U=",
-                    data: "ZGF0YQ==",
-                    version: 7,
-                },
+                Secret::Stored { key: "e1", nonce: "bm9uY2U=", data: "ZGF0YQ==", version: 7 },
             ),
         ] {
             assert_eq!(Secret::of(&value), Some(Ok(expected)), "{value}");
@@ -308,10 +305,7 @@ mod tests {
         ] {
             assert!(matches!(Secret::of(&value), Some(Err(_))), "{value}");
             assert!(is_secret(&value) && contains(&value));
-            assert_eq!(
-                *redact(&value),
-                json!({ "$secret": { "redacted": true, "version": 0 } })
-            );
+            assert_eq!(*redact(&value), json!({ "$secret": { "redacted": true, "version": 0 } }));
         }
     }
 
@@ -331,7 +325,8 @@ mod tests {
 
     #[test]
     fn secrets_are_found_with_their_place() {
-        let value = json!({ "a/b": { "$secret": "x" }, "list": [1, { "in": stored() }], "none": {} });
+        let value =
+            json!({ "a/b": { "$secret": "x" }, "list": [1, { "in": stored() }], "none": {} });
         let mut found = Vec::new();
         walk(&value, &mut |pointer, secret| {
             assert!(is_secret(secret));
@@ -340,9 +335,7 @@ mod tests {
         });
         assert_eq!(found, ["/a~1b", "/list/1/in"]);
         let mut changed = value.clone();
-        map(&mut changed, &mut |pointer, _| {
-            (pointer != "/a~1b").then(|| "text".into())
-        });
+        map(&mut changed, &mut |pointer, _| (pointer != "/a~1b").then(|| "text".into()));
         assert_eq!(
             changed,
             json!({ "a/b": { "$secret": "x" }, "list": [1, { "in": "text" }], "none": {} })
@@ -351,7 +344,8 @@ mod tests {
 
     #[test]
     fn versions_make_the_hash() {
-        let value = json!({ "a": stored(), "b": { "$secret": "x" }, "c": { "$secret": { "version": 5 } } });
+        let value =
+            json!({ "a": stored(), "b": { "$secret": "x" }, "c": { "$secret": { "version": 5 } } });
         let covered = for_hash(&value).into_owned();
         assert_eq!(
             covered,

@@ -25,7 +25,9 @@ pub enum LabelError {
     #[error("may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with a letter or digit")]
     Form,
     /// What stands before the slash is no DNS name.
-    #[error("has a prefix that is no DNS name of at most {MAX_PREFIX_BYTES} characters in lower case")]
+    #[error(
+        "has a prefix that is no DNS name of at most {MAX_PREFIX_BYTES} characters in lower case"
+    )]
     Prefix,
 }
 
@@ -146,9 +148,7 @@ impl LabelSelector {
     /// Whether labels fulfil every requirement.
     #[must_use]
     pub fn matches(&self, labels: &Labels) -> bool {
-        self.0
-            .iter()
-            .all(|requirement| requirement.test.holds(labels.get(&requirement.key)))
+        self.0.iter().all(|requirement| requirement.test.holds(labels.get(&requirement.key)))
     }
 }
 
@@ -225,7 +225,8 @@ impl<'t> Cursor<'t> {
     fn word(&mut self) -> &'t str {
         self.skip_space();
         let rest = self.rest();
-        let ends = |c: char| matches!(c, ',' | '=' | '!' | '(' | ')' | '<' | '>') || c.is_whitespace();
+        let ends =
+            |c: char| matches!(c, ',' | '=' | '!' | '(' | ')' | '<' | '>') || c.is_whitespace();
         let word = &rest[..rest.find(ends).unwrap_or(rest.len())];
         self.at += word.len();
         word
@@ -233,10 +234,7 @@ impl<'t> Cursor<'t> {
 
     fn needs(&self, wanted: &'static str) -> SelectorError {
         let before = self.text.get(..self.at).unwrap_or_default();
-        SelectorError::Form {
-            wanted,
-            at: before.chars().count() + 1,
-        }
+        SelectorError::Form { wanted, at: before.chars().count() + 1 }
     }
 
     fn key(&mut self) -> Result<String, SelectorError> {
@@ -244,20 +242,14 @@ impl<'t> Cursor<'t> {
         if key.is_empty() {
             return Err(self.needs("the key of a label"));
         }
-        let refuse = |error| SelectorError::Key {
-            key: key.to_owned(),
-            error,
-        };
+        let refuse = |error| SelectorError::Key { key: key.to_owned(), error };
         check_label_key(key).map_err(refuse)?;
         Ok(key.to_owned())
     }
 
     fn value(&mut self) -> Result<String, SelectorError> {
         let value = self.word();
-        let refuse = |error| SelectorError::Value {
-            value: value.to_owned(),
-            error,
-        };
+        let refuse = |error| SelectorError::Value { value: value.to_owned(), error };
         check_label_value(value).map_err(refuse)?;
         Ok(value.to_owned())
     }
@@ -265,10 +257,7 @@ impl<'t> Cursor<'t> {
     fn requirement(&mut self) -> Result<Requirement, SelectorError> {
         if self.take("!") {
             let key = self.key()?;
-            return Ok(Requirement {
-                key,
-                test: Test::Absent,
-            });
+            return Ok(Requirement { key, test: Test::Absent });
         }
         let key = self.key()?;
         let test = if self.take("!=") {

@@ -43,7 +43,8 @@ fn selectors_match_as_in_kubernetes() {
         ("tier in(a),site", true),
         ("in", false),
     ] {
-        let parsed: LabelSelector = selector.parse().unwrap_or_else(|error| panic!("{selector:?} {error}"));
+        let parsed: LabelSelector =
+            selector.parse().unwrap_or_else(|error| panic!("{selector:?} {error}"));
         assert_eq!(parsed.matches(&these), expected, "{selector:?}");
         assert_eq!(parsed.to_string().parse::<LabelSelector>(), Ok(parsed), "{selector:?}");
     }
@@ -68,49 +69,26 @@ fn what_is_no_selector_is_refused() {
         ("!a=b", "needs a comma or the end at character 3"),
         ("a===b", "needs a comma or the end at character 4"),
     ] {
-        assert_eq!(
-            text.parse::<LabelSelector>().unwrap_err().to_string(),
-            error,
-            "{text:?}"
-        );
+        assert_eq!(text.parse::<LabelSelector>().unwrap_err().to_string(), error, "{text:?}");
     }
-    for text in [
-        "-a",
-        "a=-b",
-        "a/b/c",
-        "A.b/c",
-        "/a",
-        "a/",
-        "\u{e4}=b",
-        "a=\u{e4}",
-        "a in (b;c)",
-        "a\nb",
-    ] {
+    for text in
+        ["-a", "a=-b", "a/b/c", "A.b/c", "/a", "a/", "\u{e4}=b", "a=\u{e4}", "a in (b;c)", "a\nb"]
+    {
         assert!(text.parse::<LabelSelector>().is_err(), "{text:?}");
     }
     let long = format!("a={}", "b".repeat(64));
     assert!(
-        long.parse::<LabelSelector>()
-            .unwrap_err()
-            .to_string()
-            .ends_with("which is longer than 63")
+        long.parse::<LabelSelector>().unwrap_err().to_string().ends_with("which is longer than 63")
     );
     let huge = "a,".repeat(MAX_SELECTOR_BYTES);
-    assert_eq!(
-        huge.parse::<LabelSelector>(),
-        Err(SelectorError::TooLong(2 * MAX_SELECTOR_BYTES))
-    );
+    assert_eq!(huge.parse::<LabelSelector>(), Err(SelectorError::TooLong(2 * MAX_SELECTOR_BYTES)));
 }
 
 #[test]
 fn keys_and_values_of_labels() {
-    for key in [
-        "a",
-        "A-b_c.9",
-        "example.org/a",
-        &"a".repeat(63),
-        &format!("{}/a", "a.".repeat(126) + "a"),
-    ] {
+    for key in
+        ["a", "A-b_c.9", "example.org/a", &"a".repeat(63), &format!("{}/a", "a.".repeat(126) + "a")]
+    {
         assert_eq!(check_label_key(key), Ok(()), "{key}");
     }
     for (key, error) in [
@@ -150,7 +128,10 @@ proptest! {
         let labels: Labels = has.then(|| ("a".to_owned(), other)).into_iter().collect();
         let matches = |text: String| text.parse::<LabelSelector>().unwrap().matches(&labels);
         prop_assert_ne!(matches(format!("{key}={value}")), matches(format!("{key}!={value}")));
-        prop_assert_ne!(matches(format!("{key} in ({value},z)")), matches(format!("{key} notin ({value},z)")));
+        prop_assert_ne!(
+            matches(format!("{key} in ({value},z)")),
+            matches(format!("{key} notin ({value},z)")),
+        );
         prop_assert_ne!(matches(key.clone()), matches(format!("!{key}")));
         let is = matches(format!("{key}={value}"));
         prop_assert!(!is || matches(key));

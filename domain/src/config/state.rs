@@ -1,5 +1,5 @@
-//! All documents at one revision. A clone shares everything and costs nothing, so that readers keep one as long as they
-//! like while commits go on.
+//! All documents at one revision. A clone shares everything and costs nothing, so that readers keep
+//! one as long as they like while commits go on.
 
 use std::collections::BTreeSet;
 use std::ops::Bound;
@@ -11,8 +11,8 @@ use super::placement::{Placement, is_active, placement, rollout_target};
 use super::{Document, Key, Kind, MAX_EFFECTIVE_BYTES, secret};
 use crate::{DocumentName, InstanceName, LayerName, NodeName, ServiceName};
 
-/// Documents larger than this make an effective configuration that is too large possible (four documents are merged, each
-/// perhaps with the change of a roll-out).
+/// Documents larger than this make an effective configuration that is too large possible (four
+/// documents are merged, each perhaps with the change of a roll-out).
 const BIG_BYTES: usize = MAX_EFFECTIVE_BYTES / 8;
 
 /// A document as it is kept in memory.
@@ -66,10 +66,7 @@ pub fn redacted(document: &Arc<Document>) -> Arc<Document> {
     }
     let mut shown = (**document).clone();
     shown.spec = Arc::new(secret::redact(&document.spec).into_owned());
-    shown.status = document
-        .status
-        .as_ref()
-        .map(|status| secret::redact(status).into_owned());
+    shown.status = document.status.as_ref().map(|status| secret::redact(status).into_owned());
     Arc::new(shown)
 }
 
@@ -127,10 +124,7 @@ impl State {
     /// A state from documents.
     #[must_use]
     pub fn new(revision: u64, documents: impl IntoIterator<Item = Document>) -> Self {
-        let mut state = Self {
-            revision,
-            ..Self::default()
-        };
+        let mut state = Self { revision, ..Self::default() };
         for document in documents {
             state.put(Arc::new(document));
         }
@@ -181,12 +175,15 @@ impl State {
     }
 
     /// Instances of a service.
-    pub fn instances<'a>(&'a self, service: &ServiceName) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
+    pub fn instances<'a>(
+        &'a self,
+        service: &ServiceName,
+    ) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
         let service = service.clone();
         let start = Key::instance(service.clone(), first_name());
-        self.documents
-            .range::<_, Key>(start..)
-            .take_while(move |(key, _)| key.kind() == Kind::Instance && key.service_name() == Some(&service))
+        self.documents.range::<_, Key>(start..).take_while(move |(key, _)| {
+            key.kind() == Kind::Instance && key.service_name() == Some(&service)
+        })
     }
 
     /// Nodes of a layer and instances placed on it directly.
@@ -225,7 +222,8 @@ impl State {
     #[must_use]
     pub fn has_schema(&self, service: &ServiceName) -> bool {
         let key = Key::service(service);
-        self.get(&key).is_some_and(|held| held.has_schema()) || self.active_on(&key).any(|held| held.has_schema())
+        self.get(&key).is_some_and(|held| held.has_schema())
+            || self.active_on(&key).any(|held| held.has_schema())
     }
 
     /// Puts a document, in place of the one of the same key.
@@ -286,8 +284,8 @@ impl State {
         self.revision = revision;
     }
 
-    /// Applies a commit, each step of another document, and says what it did, also to documents that only moved with
-    /// another.
+    /// Applies a commit, each step of another document, and says what it did, also to documents
+    /// that only moved with another.
     pub fn apply(&mut self, revision: u64, steps: impl IntoIterator<Item = Step>) -> Vec<Effect> {
         let before = self.clone();
         let mut keys: Vec<Key> = Vec::new();
@@ -315,11 +313,7 @@ impl State {
                 _ => false,
             };
             if changed {
-                effects.push(Effect {
-                    before: was,
-                    after: is,
-                    moved_only: true,
-                });
+                effects.push(Effect { before: was, after: is, moved_only: true });
             }
         }
         effects
@@ -327,7 +321,10 @@ impl State {
 
     /// Documents as they are now, to go back to with [`State::undo`].
     #[must_use]
-    pub fn originals<'k>(&self, keys: impl IntoIterator<Item = &'k Key>) -> Vec<(Key, Option<Arc<Document>>)> {
+    pub fn originals<'k>(
+        &self,
+        keys: impl IntoIterator<Item = &'k Key>,
+    ) -> Vec<(Key, Option<Arc<Document>>)> {
         keys.into_iter()
             .map(|key| (key.clone(), self.get(key).map(|held| Arc::clone(&held.document))))
             .collect()
@@ -376,10 +373,7 @@ fn aim(document: &Document) -> Option<(Key, Key)> {
 
 fn of_target(index: &OrdSet<(Key, Key)>, target: Key) -> impl Iterator<Item = &Key> + use<'_> {
     let start = (target.clone(), first_key(Kind::Layer));
-    index
-        .range(start..)
-        .take_while(move |(found, _)| *found == target)
-        .map(|(_, key)| key)
+    index.range(start..).take_while(move |(found, _)| *found == target).map(|(_, key)| key)
 }
 
 fn index_entries(document: &Document) -> Vec<(Index, (DocumentName, Key))> {
@@ -387,42 +381,43 @@ fn index_entries(document: &Document) -> Vec<(Index, (DocumentName, Key))> {
         let name: DocumentName = name?.parse().ok()?;
         Some((index, (name, document.key.clone())))
     };
-    [
-        entry(Index::Layer, document.spec_layer()),
-        entry(Index::Node, document.spec_node()),
-    ]
-    .into_iter()
-    .flatten()
-    .collect()
+    [entry(Index::Layer, document.spec_layer()), entry(Index::Node, document.spec_node())]
+        .into_iter()
+        .flatten()
+        .collect()
 }
 
-fn indexed(index: &OrdSet<(DocumentName, Key)>, name: DocumentName) -> impl Iterator<Item = &Key> + use<'_> {
+fn indexed(
+    index: &OrdSet<(DocumentName, Key)>,
+    name: DocumentName,
+) -> impl Iterator<Item = &Key> + use<'_> {
     let start = (name.clone(), first_key(Kind::Layer));
-    index
-        .range(start..)
-        .take_while(move |(found, _)| *found == name)
-        .map(|(_, key)| key)
+    index.range(start..).take_while(move |(found, _)| *found == name).map(|(_, key)| key)
 }
 
-/// No name comes before it: `0` is the first character of the alphabet of names that may stand at the beginning.
+/// No name comes before it: `0` is the first character of the alphabet of names that may stand at
+/// the beginning.
 fn first_name() -> DocumentName {
     (&InstanceName::first()).into()
 }
 
 fn first_key(kind: Kind) -> Key {
     let service = (kind == Kind::Instance).then(|| ServiceName::from(&first_name()));
-    // With a service exactly for instances this cannot fail; `rollout` is only there to have a value.
+    // With a service exactly for instances this cannot fail; `rollout` is only there to have a
+    // value.
     Key::new(kind, service, first_name()).unwrap_or_else(|_| Key::rollout(first_name()))
 }
 
-/// Documents that may count elsewhere although they did not change: instances with their node or service, roll-outs with
-/// their target.
+/// Documents that may count elsewhere although they did not change: instances with their node or
+/// service, roll-outs with their target.
 fn moved_with(before: &State, after: &State, changed: &[Key]) -> Vec<Key> {
     let keys: BTreeSet<&Key> = changed.iter().collect();
     let mut out: Vec<Key> = Vec::new();
     for key in changed {
         let is_moved = match (before.get(key), after.get(key)) {
-            (Some(was), Some(is)) => placement(before, &was.document) != placement(after, &is.document),
+            (Some(was), Some(is)) => {
+                placement(before, &was.document) != placement(after, &is.document)
+            }
             _ => true,
         };
         if !is_moved {
@@ -431,15 +426,14 @@ fn moved_with(before: &State, after: &State, changed: &[Key]) -> Vec<Key> {
         match key.kind() {
             Kind::Node => out.extend(after.on_node(&NodeName::from(key.name())).cloned()),
             Kind::Service => out.extend(
-                after
-                    .instances(&ServiceName::from(key.name()))
-                    .map(|(key, _)| key.clone()),
+                after.instances(&ServiceName::from(key.name())).map(|(key, _)| key.clone()),
             ),
             Kind::Layer | Kind::Instance | Kind::Rollout => {}
         }
     }
     let touched = keys.iter().copied().chain(&out);
-    let rollouts: BTreeSet<Key> = touched.flat_map(|target| after.aimed_at(target)).cloned().collect();
+    let rollouts: BTreeSet<Key> =
+        touched.flat_map(|target| after.aimed_at(target)).cloned().collect();
     out.extend(rollouts);
     out.retain(|key| !keys.contains(key));
     out.sort();

@@ -8,7 +8,8 @@ use std::str::FromStr;
 pub struct Timestamp(i64);
 
 impl Timestamp {
-    /// From milliseconds since 1970; what is outside the years 0000 to 9999 becomes the nearest that is not.
+    /// From milliseconds since 1970; what is outside the years 0000 to 9999 becomes the nearest
+    /// that is not.
     #[must_use]
     pub fn from_millis(millis: i64) -> Self {
         Self(millis.clamp(-62_167_219_200_000, 253_402_207_200_000))

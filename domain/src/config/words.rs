@@ -21,7 +21,8 @@ word_enum!(
     ConfigSource {
         /// The file that was mounted for the worker.
         File = "file",
-        /// A copy in its database or last-known-good file; also what the main service told before it was lost.
+        /// A copy in its database or last-known-good file; also what the main service told before
+        /// it was lost.
         Copy = "copy",
         /// The main service: the worker is connected and in sync.
         Main = "main",

@@ -18,7 +18,8 @@ const MAX_DETAIL_CHARS: usize = 200;
 pub struct ControlError {
     /// The fault.
     pub code: ErrorCode,
-    /// JSON pointer (RFC 6901) to the faulty field; in an array it begins with the index. Empty: the whole payload.
+    /// JSON pointer (RFC 6901) to the faulty field; in an array it begins with the index. Empty:
+    /// the whole payload.
     pub pointer: String,
     /// For people.
     pub detail: String,
@@ -33,15 +34,11 @@ impl ControlError {
             detail.truncate(cut);
             detail.push('…');
         }
-        Self {
-            code,
-            pointer: pointer.into(),
-            detail,
-        }
+        Self { code, pointer: pointer.into(), detail }
     }
 
-    /// The pointer without the place of the object in an array: a sender joins objects as it likes, so that place says
-    /// nothing to whoever made the object.
+    /// The pointer without the place of the object in an array: a sender joins objects as it likes,
+    /// so that place says nothing to whoever made the object.
     #[must_use]
     pub fn pointer_in_object(&self) -> &str {
         let Some(rest) = self.pointer.strip_prefix('/') else {
@@ -63,7 +60,8 @@ struct ReadError {
 }
 
 impl From<ReadError> for ControlError {
-    /// A refusal is one whatever its code: a word of a newer version becomes `invalid_value` and goes before the detail.
+    /// A refusal is one whatever its code: a word of a newer version becomes `invalid_value` and
+    /// goes before the detail.
     fn from(read: ReadError) -> Self {
         match read.code.parse() {
             Ok(code) => Self::new(code, read.pointer, read.detail),
@@ -76,7 +74,8 @@ impl From<ReadError> for ControlError {
     }
 }
 
-/// The objects of a payload, which is one or an array of them. What is not understood is left out, the others stay.
+/// The objects of a payload, which is one or an array of them. What is not understood is left out,
+/// the others stay.
 fn read_each<T: for<'de> Deserialize<'de>>(payload: &[u8]) -> Vec<T> {
     let values = match serde_json::from_slice(payload) {
         Ok(Value::Array(values)) => values,
@@ -110,25 +109,13 @@ impl Answer {
     /// The message was accepted by `flow` for `lease_s` seconds.
     #[must_use]
     pub fn granted(id: Option<String>, flow: &FlowId, lease_s: u32) -> Self {
-        Self {
-            id,
-            ok: true,
-            flow: Some(flow.to_string()),
-            lease_s: Some(lease_s),
-            error: None,
-        }
+        Self { id, ok: true, flow: Some(flow.to_string()), lease_s: Some(lease_s), error: None }
     }
 
     /// The message was refused.
     #[must_use]
     pub fn refused(id: Option<String>, error: ControlError) -> Self {
-        Self {
-            id,
-            ok: false,
-            flow: None,
-            lease_s: None,
-            error: Some(error),
-        }
+        Self { id, ok: false, flow: None, lease_s: None, error: Some(error) }
     }
 
     /// The answers of a payload: one object or an array. What is no answer is left out.
@@ -165,7 +152,13 @@ pub struct Event {
 impl Event {
     /// An event at a wall-clock time in milliseconds since 1970.
     #[must_use]
-    pub fn new(kind: EventKind, flow: &FlowId, topic: Option<&TopicName>, code: &str, unix_ms: u64) -> Self {
+    pub fn new(
+        kind: EventKind,
+        flow: &FlowId,
+        topic: Option<&TopicName>,
+        code: &str,
+        unix_ms: u64,
+    ) -> Self {
         Self {
             kind,
             flow: flow.to_string(),
@@ -175,7 +168,8 @@ impl Event {
         }
     }
 
-    /// The events of a payload: one object or an array. What is no event, or of a kind of a newer version, is left out.
+    /// The events of a payload: one object or an array. What is no event, or of a kind of a newer
+    /// version, is left out.
     #[must_use]
     pub fn read_all(payload: &[u8]) -> Vec<Self> {
         read_each(payload)
@@ -237,25 +231,21 @@ mod tests {
 
     #[test]
     fn answers_and_events_of_other_versions_are_read() {
-        let answers = Answer::read_all(br#"[{"id":"7","ok":true,"lease_s":15,"new":1}, 3, {"x":1}]"#);
+        let answers =
+            Answer::read_all(br#"[{"id":"7","ok":true,"lease_s":15,"new":1}, 3, {"x":1}]"#);
         assert_eq!(answers.len(), 1);
         assert_eq!((answers[0].id.as_deref(), answers[0].lease_s), (Some("7"), Some(15)));
         assert!(Answer::read_all(b"no json").is_empty());
         for (error, expected) in [
-            (
-                r#"{"code":"tired","detail":"no"}"#,
-                (ErrorCode::InvalidValue, "", "tired: no"),
-            ),
-            (
-                r#"{"code":"stale_epoch","pointer":"/epoch"}"#,
-                (ErrorCode::StaleEpoch, "/epoch", ""),
-            ),
+            (r#"{"code":"tired","detail":"no"}"#, (ErrorCode::InvalidValue, "", "tired: no")),
+            (r#"{"code":"stale_epoch","pointer":"/epoch"}"#, (ErrorCode::StaleEpoch, "/epoch", "")),
         ] {
             let answer = format!(r#"{{"id":"7","ok":false,"error":{error}}}"#);
             let read = Answer::read_all(answer.as_bytes()).remove(0).error.unwrap();
             assert_eq!((read.code, read.pointer.as_str(), read.detail.as_str()), expected);
         }
-        let events = br#"[{"event":"flow_started","flow":"edge/r","time":"t"},{"event":"flow_sings","flow":"edge/r","time":"t"}]"#;
+        let events =
+            br#"[{"event":"flow_started","flow":"edge/r","time":"t"},{"event":"flow_sings","flow":"edge/r","time":"t"}]"#;
         let read = Event::read_all(events);
         assert_eq!(read.len(), 1);
         assert_eq!((read[0].kind, read[0].topic.as_str()), (EventKind::FlowStarted, ""));

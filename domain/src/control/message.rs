@@ -211,10 +211,7 @@ impl WithdrawMessage {
     /// Withdraws both kinds.
     #[must_use]
     pub fn new(topic: TopicName, service: ServiceName) -> Self {
-        Self {
-            common: Common::new(topic, service),
-            kind: None,
-        }
+        Self { common: Common::new(topic, service), kind: None }
     }
 }
 
@@ -255,7 +252,8 @@ impl ControlMessage {
             match payloads.last_mut() {
                 // The closing bracket is still to come.
                 Some(last)
-                    if objects < MAX_CONTROL_OBJECTS && last.len() + text.len() + 2 <= super::MAX_CONTROL_BYTES =>
+                    if objects < MAX_CONTROL_OBJECTS
+                        && last.len() + text.len() + 2 <= super::MAX_CONTROL_BYTES =>
                 {
                     last.push(b',');
                     last.extend_from_slice(text.as_bytes());

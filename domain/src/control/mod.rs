@@ -1,11 +1,13 @@
-//! The control protocol: what services tell their flow on `blaze/flow/control`, and what it answers.
+//! The control protocol: what services tell their flow on `blaze/flow/control`, and what it
+//! answers.
 //!
 //! ```text
 //! payload ──parse_payload──► [ParsedObject] ──registry──► Answer (where `reply_to` is given), Event
 //! ControlMessage::to_json ──► payload (SDK, restored leases)
 //! ```
 //!
-//! A payload is one JSON object or an array of them. A fault of one object leaves the others of its array alone.
+//! A payload is one JSON object or an array of them. A fault of one object leaves the others of its
+//! array alone.
 
 mod answer;
 mod message;
@@ -13,7 +15,10 @@ mod parse;
 mod words;
 
 pub use answer::{Answer, ControlError, Event, rfc3339_millis};
-pub use message::{AdvertiseMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage, WithdrawMessage};
+pub use message::{
+    AdvertiseMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage,
+    WithdrawMessage,
+};
 pub use parse::{ParsedObject, parse_payload};
 pub use words::{ErrorCode, EventKind, LeaseKind};
 

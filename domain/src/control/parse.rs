@@ -7,12 +7,13 @@ use serde_json::{Map, Value};
 
 use super::answer::ControlError;
 use super::message::{
-    AdvertiseMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage, WithdrawMessage,
+    AdvertiseMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage,
+    WithdrawMessage,
 };
 use super::words::ErrorCode;
 use super::{
-    DEFAULT_TTL_S, MAX_CONTROL_BYTES, MAX_CONTROL_OBJECTS, MAX_DEPTH, MAX_ENCODING_BYTES, MAX_ID_BYTES, MAX_TTL_S,
-    MAX_TYPE_BYTES, REPLY_PREFIX,
+    DEFAULT_TTL_S, MAX_CONTROL_BYTES, MAX_CONTROL_OBJECTS, MAX_DEPTH, MAX_ENCODING_BYTES,
+    MAX_ID_BYTES, MAX_TTL_S, MAX_TYPE_BYTES, REPLY_PREFIX,
 };
 use crate::names::{ChannelName, InstanceName, NameError, TopicName};
 use crate::qos::{Durability, Reliability};
@@ -35,8 +36,8 @@ pub struct ParsedObject {
 /// Reads a control payload: one JSON object, or an array of at most 200, in at most 64 KiB.
 ///
 /// # Errors
-/// The payload as a whole is not JSON, too large, or neither an object nor an array. Faults of single objects are in
-/// their [`ParsedObject`].
+/// The payload as a whole is not JSON, too large, or neither an object nor an array. Faults of
+/// single objects are in their [`ParsedObject`].
 pub fn parse_payload(payload: &[u8]) -> Result<Vec<ParsedObject>, ControlError> {
     if payload.len() > MAX_CONTROL_BYTES {
         return Err(ControlError::new(
@@ -45,9 +46,11 @@ pub fn parse_payload(payload: &[u8]) -> Result<Vec<ParsedObject>, ControlError> 
             format!("has {} bytes, at most {MAX_CONTROL_BYTES} are allowed", payload.len()),
         ));
     }
-    let not_json = |error: serde_json::Error| ControlError::new(ErrorCode::InvalidJson, "", error.to_string());
+    let not_json =
+        |error: serde_json::Error| ControlError::new(ErrorCode::InvalidJson, "", error.to_string());
     if payload.iter().find(|byte| !byte.is_ascii_whitespace()) != Some(&b'[') {
-        // A lone text keeps its faults to itself, so a value that is no JSON is a fault of the payload.
+        // A lone text keeps its faults to itself, so a value that is no JSON is a fault of the
+        // payload.
         let value = serde_json::from_slice::<Value>(payload).map_err(not_json)?;
         return match value {
             Value::Object(object) => Ok(vec![parse_object(&object, String::new())]),
@@ -58,16 +61,14 @@ pub fn parse_payload(payload: &[u8]) -> Result<Vec<ParsedObject>, ControlError> 
             )),
         };
     }
-    // Each object is parsed for itself: one that nests too deeply or holds an absurd number does not spoil the others.
+    // Each object is parsed for itself: one that nests too deeply or holds an absurd number does
+    // not spoil the others.
     let texts = serde_json::from_slice::<Vec<&RawValue>>(payload).map_err(not_json)?;
     if texts.len() > MAX_CONTROL_OBJECTS {
         return Err(ControlError::new(
             ErrorCode::InvalidValue,
             "",
-            format!(
-                "holds {} objects, at most {MAX_CONTROL_OBJECTS} are allowed",
-                texts.len()
-            ),
+            format!("holds {} objects, at most {MAX_CONTROL_OBJECTS} are allowed", texts.len()),
         ));
     }
     Ok(texts
@@ -83,37 +84,19 @@ fn parse_element(text: &str, pointer: String) -> ParsedObject {
         Ok(_) => ControlError::new(ErrorCode::InvalidValue, pointer.clone(), "is not an object"),
         Err(error) => ControlError::new(ErrorCode::InvalidJson, pointer.clone(), error.to_string()),
     };
-    ParsedObject {
-        pointer,
-        id: None,
-        reply_to: None,
-        topic: None,
-        message: Err(error),
-    }
+    ParsedObject { pointer, id: None, reply_to: None, topic: None, message: Err(error) }
 }
 
 fn parse_object(object: &Map<String, Value>, pointer: String) -> ParsedObject {
-    let fields = Fields {
-        object,
-        pointer: &pointer,
-    };
+    let fields = Fields { object, pointer: &pointer };
     // First what an answer needs, so that every later fault can be answered.
     let reply_to = fields.reply_to();
     let id = fields.text("id", MAX_ID_BYTES);
     let topic = fields.topic();
-    let (known_id, known_reply, known_topic) = (
-        id.clone().ok().flatten(),
-        reply_to.clone().ok().flatten(),
-        topic.clone().ok(),
-    );
+    let (known_id, known_reply, known_topic) =
+        (id.clone().ok().flatten(), reply_to.clone().ok().flatten(), topic.clone().ok());
     let message = parse_message(&fields, reply_to, id, topic);
-    ParsedObject {
-        id: known_id,
-        reply_to: known_reply,
-        topic: known_topic,
-        message,
-        pointer,
-    }
+    ParsedObject { id: known_id, reply_to: known_reply, topic: known_topic, message, pointer }
 }
 
 fn parse_message(
@@ -153,10 +136,9 @@ fn parse_message(
             from: fields.from()?,
             quality: fields.quality()?,
         }),
-        Op::Withdraw => ControlMessage::Withdraw(WithdrawMessage {
-            common,
-            kind: fields.word("kind")?,
-        }),
+        Op::Withdraw => {
+            ControlMessage::Withdraw(WithdrawMessage { common, kind: fields.word("kind")? })
+        }
     })
 }
 
@@ -222,9 +204,9 @@ impl Fields<'_> {
         if !text.starts_with(REPLY_PREFIX) {
             return Err(self.wrong("reply_to", &format!("a topic under {REPLY_PREFIX}")));
         }
-        let channel = text
-            .parse()
-            .map_err(|error: NameError| self.error(ErrorCode::InvalidValue, "reply_to", error.to_string()));
+        let channel = text.parse().map_err(|error: NameError| {
+            self.error(ErrorCode::InvalidValue, "reply_to", error.to_string())
+        });
         channel.map(Some)
     }
 
@@ -243,7 +225,10 @@ impl Fields<'_> {
         }
     }
 
-    fn parsed<T: FromStr<Err: std::fmt::Display>>(&self, key: &str) -> Result<Option<T>, ControlError> {
+    fn parsed<T: FromStr<Err: std::fmt::Display>>(
+        &self,
+        key: &str,
+    ) -> Result<Option<T>, ControlError> {
         match self.get(key) {
             None => Ok(None),
             Some(Value::String(text)) => match text.parse() {
@@ -258,7 +243,10 @@ impl Fields<'_> {
         self.parsed(key)
     }
 
-    fn word<T: FromStr<Err: std::fmt::Display>>(&self, key: &str) -> Result<Option<T>, ControlError> {
+    fn word<T: FromStr<Err: std::fmt::Display>>(
+        &self,
+        key: &str,
+    ) -> Result<Option<T>, ControlError> {
         self.parsed(key)
     }
 
@@ -272,7 +260,12 @@ impl Fields<'_> {
         }
     }
 
-    fn small_integer(&self, key: &str, lowest: u32, highest: u32) -> Result<Option<u32>, ControlError> {
+    fn small_integer(
+        &self,
+        key: &str,
+        lowest: u32,
+        highest: u32,
+    ) -> Result<Option<u32>, ControlError> {
         let number = self.integer(key, lowest.into(), highest.into())?;
         Ok(number.and_then(|number| u32::try_from(number).ok()))
     }
@@ -304,10 +297,7 @@ impl Fields<'_> {
             None => Ok(OriginSelector::default()),
             Some(Value::Object(object)) => {
                 let pointer = format!("{}/from", self.pointer);
-                let fields = Fields {
-                    object,
-                    pointer: &pointer,
-                };
+                let fields = Fields { object, pointer: &pointer };
                 Ok(OriginSelector {
                     layer: fields.name("layer")?,
                     node: fields.name("node")?,
@@ -320,9 +310,7 @@ impl Fields<'_> {
 
     fn quality(&self) -> Result<Quality, ControlError> {
         Ok(Quality {
-            encoding: self
-                .text("encoding", MAX_ENCODING_BYTES)?
-                .filter(|text| !text.is_empty()),
+            encoding: self.text("encoding", MAX_ENCODING_BYTES)?.filter(|text| !text.is_empty()),
             type_name: self.text("type", MAX_TYPE_BYTES)?.unwrap_or_default(),
             type_hash: self.text("type_hash", MAX_TYPE_BYTES)?.unwrap_or_default(),
             reliability: self.word("reliability")?.unwrap_or(Reliability::BestEffort),

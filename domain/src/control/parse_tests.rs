@@ -28,9 +28,7 @@ fn the_examples_of_the_contract_parse() {
         {"op":"request","topic":"imu/data","service":"logger","max_rate_hz":10,"lifespan_ms":500,"id":"7","reply_to":"blaze/reply/logger-0"},
         {"op":"withdraw","topic":"imu/data","service":"imu-driver"}]"#;
     let objects = parse_payload(payload).unwrap();
-    let [advertise, request, withdraw] = objects.as_slice() else {
-        panic!("{objects:?}")
-    };
+    let [advertise, request, withdraw] = objects.as_slice() else { panic!("{objects:?}") };
     let topic: TopicName = "imu/data".parse().unwrap();
     let mut expected = AdvertiseMessage::new(topic.clone(), "imu-driver".parse().unwrap());
     expected.rate_hz = Some(50.0);
@@ -52,7 +50,9 @@ fn the_examples_of_the_contract_parse() {
 
 #[test]
 fn defaults_are_those_of_the_contract() {
-    let ControlMessage::Advertise(advertise) = message(&with("advertise", "unknown_field", &json!([{}]))) else {
+    let ControlMessage::Advertise(advertise) =
+        message(&with("advertise", "unknown_field", &json!([{}])))
+    else {
         panic!("not an advertise")
     };
     assert_eq!(advertise.common.instance.as_str(), "0");
@@ -67,12 +67,14 @@ fn defaults_are_those_of_the_contract() {
         (Reliability::BestEffort, Durability::Volatile)
     );
     assert_eq!((quality.depth, quality.lifespan_ms), (1, 0));
-    let ControlMessage::Request(request) = message(&with("request", "max_rate_hz", &Value::Null)) else {
+    let ControlMessage::Request(request) = message(&with("request", "max_rate_hz", &Value::Null))
+    else {
         panic!("not a request")
     };
     assert_eq!((request.max_rate_hz, request.bare, request.ttl_s), (None, false, 15));
     assert!(request.from.is_any());
-    let ControlMessage::Withdraw(withdraw) = message(&with("withdraw", "kind", &json!("request"))) else {
+    let ControlMessage::Withdraw(withdraw) = message(&with("withdraw", "kind", &json!("request")))
+    else {
         panic!("not a withdraw")
     };
     assert_eq!(withdraw.kind, Some(LeaseKind::Request));
@@ -96,21 +98,13 @@ fn every_value_in_range_is_taken() {
         ("advertise", "instance", json!("7")),
         ("advertise", "layer", json!("edge")),
         ("advertise", "node", json!("robot-1")),
-        (
-            "advertise",
-            "encoding",
-            json!("application/cdr; type=sensor_msgs/msg/Imu"),
-        ),
+        ("advertise", "encoding", json!("application/cdr; type=sensor_msgs/msg/Imu")),
         ("advertise", "type", json!("sensor_msgs/msg/Imu")),
         ("advertise", "type_hash", json!(format!("RIHS01_{}", "a".repeat(64)))),
         ("advertise", "bare", json!("of no meaning here")),
         ("request", "bare", json!(true)),
         ("request", "from", json!({})),
-        (
-            "request",
-            "from",
-            json!({"layer": "edge", "node": "robot-7", "service": "imu"}),
-        ),
+        ("request", "from", json!({"layer": "edge", "node": "robot-7", "service": "imu"})),
         ("request", "rate_hz", json!("of no meaning here")),
         ("withdraw", "ttl_s", json!("of no meaning here")),
         ("withdraw", "kind", json!("advertise")),
@@ -132,22 +126,10 @@ fn every_fault_has_its_code_and_place() {
         ("advertise", "topic", json!(""), ErrorCode::InvalidTopic, "/topic"),
         ("advertise", "topic", json!("/imu"), ErrorCode::InvalidTopic, "/topic"),
         ("advertise", "topic", json!("a b"), ErrorCode::InvalidTopic, "/topic"),
-        (
-            "advertise",
-            "topic",
-            json!("t".repeat(201)),
-            ErrorCode::InvalidTopic,
-            "/topic",
-        ),
+        ("advertise", "topic", json!("t".repeat(201)), ErrorCode::InvalidTopic, "/topic"),
         ("advertise", "topic", json!(5), bad, "/topic"),
         ("advertise", "topic", json!("blaze"), ErrorCode::ReservedTopic, "/topic"),
-        (
-            "request",
-            "topic",
-            json!("blaze/flow/control"),
-            ErrorCode::ReservedTopic,
-            "/topic",
-        ),
+        ("request", "topic", json!("blaze/flow/control"), ErrorCode::ReservedTopic, "/topic"),
         ("request", "from", json!("edge"), bad, "/from"),
         ("request", "from", json!({"layer": "Edge"}), bad, "/from/layer"),
         ("request", "from", json!({"node": 1}), bad, "/from/node"),
@@ -158,18 +140,12 @@ fn every_fault_has_its_code_and_place() {
         ("withdraw", "kind", json!(1), bad, "/kind"),
     ];
     for (key, values) in [
-        (
-            "service",
-            vec![Value::Null, json!(1), json!("A"), json!("a".repeat(64))],
-        ),
+        ("service", vec![Value::Null, json!(1), json!("A"), json!("a".repeat(64))]),
         ("instance", vec![json!(0), json!(""), json!("-a")]),
         ("layer", vec![json!(["edge"]), json!("Edge")]),
         ("node", vec![json!({}), json!("")]),
         ("epoch", vec![json!(-1), json!("1"), json!(1.5), json!(1e30)]),
-        (
-            "ttl_s",
-            vec![json!(86_401), json!(-1), json!("15"), json!(0.5), json!(true)],
-        ),
+        ("ttl_s", vec![json!(86_401), json!(-1), json!("15"), json!(0.5), json!(true)]),
         ("id", vec![json!(7), json!("i".repeat(257)), json!("a\nb")]),
         (
             "reply_to",
@@ -197,31 +173,18 @@ fn every_fault_has_its_code_and_place() {
         }
     }
     for (op, key, value, code, pointer) in table {
-        let pointer = if pointer.is_empty() {
-            format!("/{key}")
-        } else {
-            pointer.to_owned()
-        };
+        let pointer = if pointer.is_empty() { format!("/{key}") } else { pointer.to_owned() };
         let faulty = with(op, key, &value);
         let error = one(&faulty).message.unwrap_err();
-        assert_eq!(
-            (error.code, error.pointer.as_str()),
-            (code, pointer.as_str()),
-            "{faulty}"
-        );
+        assert_eq!((error.code, error.pointer.as_str()), (code, pointer.as_str()), "{faulty}");
         assert!(!error.detail.is_empty());
         // In an array the index comes first, and the others are not spoilt.
         let good = with("advertise", "rate_hz", &json!(1));
         let objects = parse_payload(json!([good, faulty, good]).to_string().as_bytes()).unwrap();
-        let found: Vec<_> = objects
-            .iter()
-            .map(|object| object.message.clone().map(|_| ()))
-            .collect();
+        let found: Vec<_> =
+            objects.iter().map(|object| object.message.clone().map(|_| ())).collect();
         let error = objects[1].message.clone().unwrap_err();
-        assert_eq!(
-            (error.code, error.pointer.as_str()),
-            (code, format!("/1{pointer}").as_str())
-        );
+        assert_eq!((error.code, error.pointer.as_str()), (code, format!("/1{pointer}").as_str()));
         assert!(found[0].is_ok() && found[2].is_ok());
     }
 }
@@ -336,16 +299,8 @@ fn any_message() -> impl Strategy<Value = ControlMessage> {
             encoding,
             type_name,
             type_hash: String::new(),
-            reliability: if strong {
-                Reliability::Reliable
-            } else {
-                Reliability::BestEffort
-            },
-            durability: if strong {
-                Durability::Volatile
-            } else {
-                Durability::TransientLocal
-            },
+            reliability: if strong { Reliability::Reliable } else { Reliability::BestEffort },
+            durability: if strong { Durability::Volatile } else { Durability::TransientLocal },
             depth,
             priority: class.map(|class| Priority::ALL[class]),
             lifespan_ms,
@@ -390,7 +345,8 @@ proptest! {
     fn messages_survive_their_json(messages in proptest::collection::vec(any_message(), 1..20)) {
         let mut back = Vec::new();
         for payload in ControlMessage::to_payloads(&messages) {
-            back.extend(parse_payload(&payload).unwrap().into_iter().map(|object| object.message.unwrap()));
+            back.extend(parse_payload(&payload).unwrap().into_iter()
+                .map(|object| object.message.unwrap()));
         }
         prop_assert_eq!(back, messages);
     }

@@ -10,7 +10,8 @@ use super::walk::Section;
 use crate::control::LeaseKind;
 use crate::names::TopicName;
 
-/// Which origins: `layer/node/service`, where `*` stands for any name and missing segments at the end for any names.
+/// Which origins: `layer/node/service`, where `*` stands for any name and missing segments at the
+/// end for any names.
 ///
 /// ```
 /// use blaze_domain::node_file::OriginPattern;
@@ -62,9 +63,7 @@ impl OriginPattern {
     #[must_use]
     pub fn matches(&self, layer: &str, node: &str, service: &str) -> bool {
         let wanted = self.0.iter().zip([layer, node, service]);
-        wanted
-            .into_iter()
-            .all(|(part, name)| part.as_deref().is_none_or(|part| part == name))
+        wanted.into_iter().all(|(part, name)| part.as_deref().is_none_or(|part| part == name))
     }
 }
 
@@ -87,17 +86,15 @@ pub struct OriginRules {
 
 impl OriginRules {
     fn section(s: &mut Section<'_>) -> Self {
-        Self {
-            allow: s.opt("allow", |node| node.list(parsed)),
-            deny: s.list("deny", parsed),
-        }
+        Self { allow: s.opt("allow", |node| node.list(parsed)), deny: s.list("deny", parsed) }
     }
 
     /// Whether an origin may.
     #[must_use]
     pub fn allows(&self, layer: &str, node: &str, service: &str) -> bool {
         let fits = |pattern: &OriginPattern| pattern.matches(layer, node, service);
-        self.allow.as_ref().is_none_or(|allow| allow.iter().any(fits)) && !self.deny.iter().any(fits)
+        self.allow.as_ref().is_none_or(|allow| allow.iter().any(fits))
+            && !self.deny.iter().any(fits)
     }
 }
 
@@ -117,11 +114,7 @@ impl AccessRule {
         let pattern = s.need("match", parsed);
         let advertise = s.sub("advertise", |s| Some(OriginRules::section(s))).map(Arc::new);
         let request = s.sub("request", |s| Some(OriginRules::section(s))).map(Arc::new);
-        Some(Self {
-            pattern: pattern?,
-            advertise,
-            request,
-        })
+        Some(Self { pattern: pattern?, advertise, request })
     }
 }
 
@@ -183,18 +176,18 @@ mod tests {
     }
 
     fn rules(allow: &[&str], deny: &[&str]) -> OriginRules {
-        OriginRules {
-            allow: (!allow.is_empty()).then(|| read(allow)),
-            deny: read(deny),
-        }
+        OriginRules { allow: (!allow.is_empty()).then(|| read(allow)), deny: read(deny) }
     }
 
     fn access(of: &[(&str, Option<OriginRules>, Option<OriginRules>)]) -> AccessRules {
-        let rule = |(pattern, advertise, request): &(&str, Option<OriginRules>, Option<OriginRules>)| AccessRule {
-            pattern: pattern.parse().unwrap(),
-            advertise: advertise.clone().map(Arc::new),
-            request: request.clone().map(Arc::new),
-        };
+        let rule =
+            |(pattern, advertise, request): &(&str, Option<OriginRules>, Option<OriginRules>)| {
+                AccessRule {
+                    pattern: pattern.parse().unwrap(),
+                    advertise: advertise.clone().map(Arc::new),
+                    request: request.clone().map(Arc::new),
+                }
+            };
         AccessRules(of.iter().map(rule).collect())
     }
 
@@ -240,10 +233,7 @@ mod tests {
         assert!(ruled.allows("edge", "robot-1", "a"));
         assert!(!ruled.allows("edge", "robot-2", "a"));
         assert!(!ruled.allows("fog", "robot-1", "a"));
-        let nobody = OriginRules {
-            allow: Some(Vec::new()),
-            deny: Vec::new(),
-        };
+        let nobody = OriginRules { allow: Some(Vec::new()), deny: Vec::new() };
         assert!(!nobody.allows("edge", "robot-1", "a"));
     }
 
@@ -254,7 +244,13 @@ mod tests {
             ("**", Some(rules(&["fog"], &[])), Some(rules(&[], &["cloud"]))),
         ]);
         let of = ruled.of(&"cmd/stop".parse().unwrap());
-        assert!(of.allows(LeaseKind::Advertise, "edge", "n", "s") && !of.allows(LeaseKind::Advertise, "fog", "n", "s"));
-        assert!(of.allows(LeaseKind::Request, "fog", "n", "s") && !of.allows(LeaseKind::Request, "cloud", "n", "s"));
+        assert!(
+            of.allows(LeaseKind::Advertise, "edge", "n", "s")
+                && !of.allows(LeaseKind::Advertise, "fog", "n", "s")
+        );
+        assert!(
+            of.allows(LeaseKind::Request, "fog", "n", "s")
+                && !of.allows(LeaseKind::Request, "cloud", "n", "s")
+        );
     }
 }

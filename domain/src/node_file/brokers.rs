@@ -13,8 +13,8 @@ use crate::qos::word_enum;
 
 /// Highest DDS domain whose ports stay below the range that systems give out by themselves.
 pub const MAX_DDS_DOMAIN: u16 = 100;
-/// Smallest MTU of the way between flows, in bytes, as IPv6 demands it of every link: a datagram of the link of 1,024 bytes
-/// fits one packet together with all headers.
+/// Smallest MTU of the way between flows, in bytes, as IPv6 demands it of every link: a datagram of
+/// the link of 1,024 bytes fits one packet together with all headers.
 pub const MIN_MTU: u16 = 1280;
 
 /// The brokers of the three scopes; each may be missing.
@@ -103,13 +103,7 @@ impl RedisBroker {
         let url = s.need("url", url(&["redis://", "rediss://", "redis+unix://", "unix://"]));
         let (prefix, user) = (s.or("prefix", prefix, String::new()), s.opt("user", text));
         let (password_file, tls) = (s.opt("password_file", path), s.sub("tls", RedisTls::section));
-        Some(Self {
-            url: url?,
-            prefix,
-            user,
-            password_file,
-            tls,
-        })
+        Some(Self { url: url?, prefix, user, password_file, tls })
     }
 }
 
@@ -151,10 +145,7 @@ impl DdsLayerBroker {
     fn section(s: &mut Section<'_>) -> Option<Self> {
         let domain = s.need("domain", whole(0, MAX_DDS_DOMAIN));
         let interface = s.need("interface", address);
-        Some(Self {
-            domain: domain?,
-            interface: interface?,
-        })
+        Some(Self { domain: domain?, interface: interface? })
     }
 }
 
@@ -179,11 +170,7 @@ impl KafkaBroker {
         });
         let prefix = s.or("prefix", prefix, String::new());
         let properties = s.opt("properties", properties).unwrap_or_default();
-        Some(Self {
-            bootstrap: bootstrap?,
-            prefix,
-            properties,
-        })
+        Some(Self { bootstrap: bootstrap?, prefix, properties })
     }
 }
 
@@ -212,14 +199,7 @@ impl InterDds {
         let peer_slots = s.or("peer_slots", whole(1, 119), 4);
         let mtu = s.or("mtu", whole(MIN_MTU, u16::MAX), 1500);
         let chunking = s.or("chunking", parsed, Chunking::Auto);
-        Some(Self {
-            domain: domain?,
-            listen: listen?,
-            peers,
-            peer_slots,
-            mtu,
-            chunking,
-        })
+        Some(Self { domain: domain?, listen: listen?, peers, peer_slots, mtu, chunking })
     }
 }
 
@@ -300,7 +280,9 @@ fn prefix(node: &Node<'_>) -> Option<String> {
 fn host_port(node: &Node<'_>) -> Option<String> {
     formed("HOST:PORT", |text| {
         let (host, port) = text.rsplit_once(':')?;
-        let good = !host.is_empty() && !host.contains(char::is_whitespace) && port.parse::<u16>().is_ok_and(|p| p > 0);
+        let good = !host.is_empty()
+            && !host.contains(char::is_whitespace)
+            && port.parse::<u16>().is_ok_and(|p| p > 0);
         good.then(|| text.to_owned())
     })(node)
 }

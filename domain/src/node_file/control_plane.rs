@@ -68,9 +68,7 @@ pub struct ListenSection {
 
 impl ListenSection {
     fn section(s: &mut Section<'_>, port: u16) -> Self {
-        Self {
-            listen: s.or("listen", socket, loopback(port)),
-        }
+        Self { listen: s.or("listen", socket, loopback(port)) }
     }
 }
 
@@ -130,9 +128,7 @@ pub enum StoreSection {
 
 impl Default for StoreSection {
     fn default() -> Self {
-        Self::Sqlite {
-            path: PathBuf::from("./blaze-config.db"),
-        }
+        Self::Sqlite { path: PathBuf::from("./blaze-config.db") }
     }
 }
 
@@ -140,9 +136,7 @@ impl StoreSection {
     fn section(s: &mut Section<'_>) -> Option<Self> {
         s.one_of(&[
             ("sqlite", |s| {
-                Some(Self::Sqlite {
-                    path: s.or("path", path, PathBuf::from("./blaze-config.db")),
-                })
+                Some(Self::Sqlite { path: s.or("path", path, PathBuf::from("./blaze-config.db")) })
             }),
             ("mongodb", |s| {
                 let (uri, database) = mongodb(s, "blaze_main")?;
@@ -215,12 +209,7 @@ impl JwtKey {
     fn section(s: &mut Section<'_>) -> Option<Self> {
         let (id, algorithm) = (s.need("id", text), s.need("alg", parsed));
         let (file, sign) = (s.need("file", path), s.or("sign", boolean, false));
-        Some(Self {
-            id: id?,
-            algorithm: algorithm?,
-            file: file?,
-            sign,
-        })
+        Some(Self { id: id?, algorithm: algorithm?, file: file?, sign })
     }
 }
 

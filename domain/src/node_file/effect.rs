@@ -27,11 +27,8 @@ pub(super) fn warn_of_what_is_not_in_effect(tree: &Value, root: &Node<'_>) {
 }
 
 fn warn_of_keys(section: &Value, keys: &[&str], node: &Node<'_>) {
-    let given: Vec<&str> = keys
-        .iter()
-        .copied()
-        .filter(|key| section.get(key).is_some_and(|v| !v.is_null()))
-        .collect();
+    let given: Vec<&str> =
+        keys.iter().copied().filter(|key| section.get(key).is_some_and(|v| !v.is_null())).collect();
     if !given.is_empty() {
         node.warn(format!("{}: {NOT_YET}", given.join(", ")));
     }
@@ -39,7 +36,5 @@ fn warn_of_keys(section: &Value, keys: &[&str], node: &Node<'_>) {
 
 /// The value at a path of plain keys; nothing where it is `null` or missing.
 fn find<'v>(tree: &'v Value, path: &str) -> Option<&'v Value> {
-    path.split('.')
-        .try_fold(tree, |value, key| value.get(key))
-        .filter(|value| !value.is_null())
+    path.split('.').try_fold(tree, |value, key| value.get(key)).filter(|value| !value.is_null())
 }

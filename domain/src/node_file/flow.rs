@@ -10,7 +10,8 @@ use crate::qos::{Priority, word_enum};
 
 /// What one Mbit/s of the file is, in bytes per second: 1024² bit.
 const BYTES_PER_MBIT: f64 = 1024.0 * 1024.0 / 8.0;
-/// 64 KiB: unless the file says otherwise, a topic with payloads above it is large, and a payload worth compressing.
+/// 64 KiB: unless the file says otherwise, a topic with payloads above it is large, and a payload
+/// worth compressing.
 pub const LARGE_BYTES: u32 = 65_536;
 /// Longest lifespan: a day.
 const MAX_LIFESPAN_MS: u32 = 86_400_000;
@@ -51,7 +52,8 @@ impl FlowSection {
         }
     }
 
-    /// What the rules say of one topic: each value is that of the first matching rule that gives it.
+    /// What the rules say of one topic: each value is that of the first matching rule that gives
+    /// it.
     #[must_use]
     pub fn topic(&self, topic: &TopicName) -> TopicSettings {
         let values = TopicValues::of(&self.topics, topic);
@@ -67,7 +69,8 @@ impl FlowSection {
 /// `flow.bandwidth`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BandwidthSection {
-    /// Budget of the inter scope in Mbit/s of 1024² bit; see [`BandwidthSection::limit_bytes_per_s`].
+    /// Budget of the inter scope in Mbit/s of 1024² bit; see
+    /// [`BandwidthSection::limit_bytes_per_s`].
     pub limit_mbps: f64,
     /// β: what one topic may take of the budget, 0 to 1.
     pub per_message_share: f64,
@@ -111,7 +114,8 @@ impl BandwidthSection {
         }
     }
 
-    /// The budget of all links together: `B_avail = L_client · 1024² / 8`, in bytes per second (F9).
+    /// The budget of all links together: `B_avail = L_client · 1024² / 8`, in bytes per second
+    /// (F9).
     #[must_use]
     pub fn limit_bytes_per_s(&self) -> f64 {
         self.limit_mbps * BYTES_PER_MBIT
@@ -137,9 +141,7 @@ fn links(node: &Node<'_>) -> Option<BTreeMap<LayerName, LinkLimit>> {
             Ok(layer) => Some(layer),
             Err(error) => node.fault(format!("the name of a layer {error}")),
         };
-        let limit = node
-            .section(|s| s.need("limit_mbps", number(0.001, MAX_MBPS)))
-            .flatten();
+        let limit = node.section(|s| s.need("limit_mbps", number(0.001, MAX_MBPS))).flatten();
         Some((layer?, LinkLimit { limit_mbps: limit? }))
     };
     Some(node.entries().into_iter().filter_map(read).collect())
@@ -195,12 +197,8 @@ impl Default for Compression {
 }
 
 impl Compression {
-    const DEFAULT: Self = Self {
-        codec: Codec::Lz4,
-        level: 10,
-        min_bytes: LARGE_BYTES,
-        adaptive: true,
-    };
+    const DEFAULT: Self =
+        Self { codec: Codec::Lz4, level: 10, min_bytes: LARGE_BYTES, adaptive: true };
 
     fn section(s: &mut Section<'_>) -> Self {
         Self::DEFAULT.with(CompressionOverride::section(s))
@@ -260,7 +258,8 @@ pub struct TopicRule {
     pub values: TopicValues,
 }
 
-/// The values that rules may give; what is absent is left to the next rule that matches, in the end to the defaults.
+/// The values that rules may give; what is absent is left to the next rule that matches, in the end
+/// to the defaults.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TopicValues {
     /// Class on the inter scope.
@@ -302,10 +301,7 @@ impl TopicRule {
             lifespan_ms: s.opt("lifespan_ms", whole(0, MAX_LIFESPAN_MS)),
             compression: s.sub_or_empty("compression", CompressionOverride::section),
         };
-        Some(Self {
-            pattern: pattern?,
-            values,
-        })
+        Some(Self { pattern: pattern?, values })
     }
 }
 

@@ -5,8 +5,9 @@
 //!                                                                     └──▶ every fault, each with its path
 //! ```
 //!
-//! Reading is strict: unknown keys, wrong types and values out of range are faults, and all of them are reported at
-//! once. Each section states its keys, ranges and defaults in one function, one line per key.
+//! Reading is strict: unknown keys, wrong types and values out of range are faults, and all of them
+//! are reported at once. Each section states its keys, ranges and defaults in one function, one
+//! line per key.
 
 mod access;
 mod brokers;
@@ -26,23 +27,27 @@ use std::path::PathBuf;
 
 use serde_json::Value;
 
-pub use access::{AccessRule, AccessRules, OriginPattern, OriginPatternError, OriginRules, TopicAccess};
+pub use access::{
+    AccessRule, AccessRules, OriginPattern, OriginPatternError, OriginRules, TopicAccess,
+};
 pub use brokers::{
-    Brokers, Chunking, DdsLayerBroker, InterDds, KafkaBroker, LayerBroker, MAX_DDS_DOMAIN, MIN_MTU, NodeBroker,
-    RedisBroker, RedisTls, Ros2Distro, Ros2Plugin,
+    Brokers, Chunking, DdsLayerBroker, InterDds, KafkaBroker, LayerBroker, MAX_DDS_DOMAIN, MIN_MTU,
+    NodeBroker, RedisBroker, RedisTls, Ros2Distro, Ros2Plugin,
 };
 pub use control_plane::{
-    AuthSection, ControlPlaneSection, EncryptionKey, EncryptionSection, GrpcSection, HistorySection, JwksSource,
-    JwtAlgorithm, JwtKey, LimitsSection, ListenSection, StoreSection, TlsSection,
+    AuthSection, ControlPlaneSection, EncryptionKey, EncryptionSection, GrpcSection,
+    HistorySection, JwksSource, JwtAlgorithm, JwtKey, LimitsSection, ListenSection, StoreSection,
+    TlsSection,
 };
 pub use flow::{
-    BandwidthSection, Codec, Compression, CompressionOverride, FlowSection, LARGE_BYTES, LinkLimit, SharePolicy,
-    TopicRule, TopicSettings, TopicValues, WireOverhead,
+    BandwidthSection, Codec, Compression, CompressionOverride, FlowSection, LARGE_BYTES, LinkLimit,
+    SharePolicy, TopicRule, TopicSettings, TopicValues, WireOverhead,
 };
 pub use pattern::{PatternError, TopicPattern};
 pub use plan_file::{FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedLane, PlannedTopic};
 pub use services::{
-    AdminSection, CacheSection, ConfigSection, DatabaseSection, LogFormat, LogSection, MonitorSection, WorkerSection,
+    AdminSection, CacheSection, ConfigSection, DatabaseSection, LogFormat, LogSection,
+    MonitorSection, WorkerSection,
 };
 
 use crate::MAX_PAYLOAD_BYTES;
@@ -133,7 +138,8 @@ pub struct NodeSection {
     pub name: NodeName,
 }
 
-/// The whole node file. A section that is missing is `None`, or has its defaults where every key has one.
+/// The whole node file. A section that is missing is `None`, or has its defaults where every key
+/// has one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NodeFile {
     /// `layer`.
@@ -194,11 +200,7 @@ impl NodeFile {
     fn section(s: &mut Section<'_>) -> Self {
         Self {
             layer: s.sub("layer", layer),
-            node: s.sub("node", |s| {
-                Some(NodeSection {
-                    name: s.need("name", parsed)?,
-                })
-            }),
+            node: s.sub("node", |s| Some(NodeSection { name: s.need("name", parsed)? })),
             brokers: s.sub_or_empty("brokers", Brokers::section),
             admin: s.sub_or_empty("admin", AdminSection::section),
             config: s.sub("config", ConfigSection::section),
@@ -213,16 +215,14 @@ impl NodeFile {
         }
     }
 
-    /// What `blaze-flow` needs besides a file without faults: a layer, a node and at least one broker.
+    /// What `blaze-flow` needs besides a file without faults: a layer, a node and at least one
+    /// broker.
     #[must_use]
     pub fn check_for_flow(&self) -> Vec<Fault> {
         let mut faults = Vec::new();
         let mut demand = |present: bool, path: &str, detail: &str| {
             if !present {
-                faults.push(Fault {
-                    path: path.to_owned(),
-                    detail: detail.to_owned(),
-                });
+                faults.push(Fault { path: path.to_owned(), detail: detail.to_owned() });
             }
         };
         demand(self.layer.is_some(), "layer", "is required by blaze-flow");
@@ -237,7 +237,9 @@ impl NodeFile {
     #[must_use]
     pub fn cache_redis(&self) -> Option<&RedisBroker> {
         match (&self.cache, &self.brokers.node) {
-            (Some(CacheSection::Redis(redis)), _) | (None, Some(NodeBroker::Redis(redis))) => Some(redis),
+            (Some(CacheSection::Redis(redis)), _) | (None, Some(NodeBroker::Redis(redis))) => {
+                Some(redis)
+            }
             (None, Some(NodeBroker::Memory) | None) => None,
         }
     }
@@ -267,7 +269,8 @@ impl NodeFile {
         .chain(plugins.map(|plugin| (plugin.domain, plugin.path.clone() + ".domain")));
         for (domain, path) in given {
             if let Some((_, other)) = seen.iter().find(|(used, _)| *used == domain) {
-                let detail = format!("{domain} is also {other}; all DDS domains of a node file differ");
+                let detail =
+                    format!("{domain} is also {other}; all DDS domains of a node file differ");
                 report.faults.borrow_mut().push(Fault { path, detail });
             } else {
                 seen.push((domain, path));
@@ -279,10 +282,7 @@ impl NodeFile {
 fn layer(s: &mut Section<'_>) -> Option<LayerSection> {
     let name = s.need("name", parsed);
     let kind = s.need("kind", parsed);
-    Some(LayerSection {
-        name: name?,
-        kind: kind?,
-    })
+    Some(LayerSection { name: name?, kind: kind? })
 }
 
 /// `auto`, `true` or `false`.
@@ -295,12 +295,15 @@ fn auto_bool(node: &Node<'_>) -> Option<AutoBool> {
     }
 }
 
-/// A URL that starts with one of the schemes; it is not repeated in faults, for it may hold a password.
+/// A URL that starts with one of the schemes; it is not repeated in faults, for it may hold a
+/// password.
 fn url(schemes: &'static [&'static str]) -> impl Fn(&Node<'_>) -> Option<SecretText> {
     move |node| {
         let text = readers::text(node)?;
         match schemes.iter().find_map(|scheme| text.strip_prefix(scheme)) {
-            Some(rest) if !rest.is_empty() && !rest.contains(char::is_whitespace) => Some(SecretText(text)),
+            Some(rest) if !rest.is_empty() && !rest.contains(char::is_whitespace) => {
+                Some(SecretText(text))
+            }
             _ => node.fault(format!("is not a URL that starts with {}", schemes.join(" or "))),
         }
     }

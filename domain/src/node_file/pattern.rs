@@ -68,10 +68,7 @@ impl FromStr for TopicPattern {
                 part => parts.push(part),
             }
         }
-        Ok(Self {
-            text: text.to_owned(),
-            parts,
-        })
+        Ok(Self { text: text.to_owned(), parts })
     }
 }
 
@@ -81,9 +78,9 @@ impl Part {
             "" => Err(PatternError::EmptySegment),
             "*" => Ok(Self::One),
             "**" => Ok(Self::Many),
-            _ if segment.contains('*') => Err(PatternError::PartialStar {
-                segment: segment.to_owned(),
-            }),
+            _ if segment.contains('*') => {
+                Err(PatternError::PartialStar { segment: segment.to_owned() })
+            }
             _ => match segment
                 .chars()
                 .find(|c| !c.is_ascii_alphanumeric() && !matches!(c, '_' | '-'))
@@ -110,7 +107,8 @@ impl TopicPattern {
     pub fn matches(&self, topic: &TopicName) -> bool {
         let segments: Vec<&str> = topic.as_str().split('/').collect();
         let (mut part, mut at) = (0, 0);
-        // Where to go on when the present attempt fails: behind the last `**`, one segment further than before.
+        // Where to go on when the present attempt fails: behind the last `**`, one segment further
+        // than before.
         let mut retry: Option<(usize, usize)> = None;
         while at < segments.len() {
             match self.parts.get(part) {
@@ -140,10 +138,7 @@ impl TopicPattern {
     /// The pattern that every topic fits: `**`.
     #[must_use]
     pub fn all() -> Self {
-        Self {
-            text: "**".to_owned(),
-            parts: vec![Part::Many],
-        }
+        Self { text: "**".to_owned(), parts: vec![Part::Many] }
     }
 }
 
@@ -166,10 +161,7 @@ mod tests {
     use super::*;
 
     fn fits(pattern: &str, topic: &str) -> bool {
-        pattern
-            .parse::<TopicPattern>()
-            .unwrap()
-            .matches(&topic.parse().unwrap())
+        pattern.parse::<TopicPattern>().unwrap().matches(&topic.parse().unwrap())
     }
 
     #[test]
@@ -198,10 +190,12 @@ mod tests {
     fn by_definition(parts: &[&str], segments: &[&str]) -> bool {
         match parts.split_first() {
             None => segments.is_empty(),
-            Some((&"**", rest)) => (0..=segments.len()).any(|skip| by_definition(rest, &segments[skip..])),
-            Some((part, rest)) => segments
-                .split_first()
-                .is_some_and(|(segment, others)| (*part == "*" || part == segment) && by_definition(rest, others)),
+            Some((&"**", rest)) => {
+                (0..=segments.len()).any(|skip| by_definition(rest, &segments[skip..]))
+            }
+            Some((part, rest)) => segments.split_first().is_some_and(|(segment, others)| {
+                (*part == "*" || part == segment) && by_definition(rest, others)
+            }),
         }
     }
 
@@ -211,7 +205,10 @@ mod tests {
             parts in prop::collection::vec(prop::sample::select(vec!["a", "b", "*", "**"]), 1..7),
             segments in prop::collection::vec(prop::sample::select(vec!["a", "b"]), 1..7),
         ) {
-            prop_assert_eq!(fits(&parts.join("/"), &segments.join("/")), by_definition(&parts, &segments));
+            prop_assert_eq!(
+                fits(&parts.join("/"), &segments.join("/")),
+                by_definition(&parts, &segments),
+            );
         }
 
         #[test]

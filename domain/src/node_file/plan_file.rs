@@ -95,7 +95,8 @@ impl PlanFile {
     pub fn read(tree: &Value) -> Result<Self, Vec<Fault>> {
         let report = Report::default();
         let root = Node::root(tree, &report);
-        let flows = root.section(|s| s.need("flows", |node| node.list(|flow| flow.section(flow_of).flatten())));
+        let flows = root
+            .section(|s| s.need("flows", |node| node.list(|flow| flow.section(flow_of).flatten())));
         let faults = report.faults.take();
         match flows.flatten() {
             Some(flows) if faults.is_empty() => Ok(Self { flows }),
@@ -118,10 +119,9 @@ fn flow_of(s: &mut Section<'_>) -> Option<PlannedFlow> {
                 .node
                 .fault("holds node_file and what a node file says; only one of both is allowed");
         }
-        (None, Some(layer), Some(node)) => FlowSource::Inline {
-            flow: FlowId::new(layer, node),
-            bandwidth: Box::new(bandwidth),
-        },
+        (None, Some(layer), Some(node)) => {
+            FlowSource::Inline { flow: FlowId::new(layer, node), bandwidth: Box::new(bandwidth) }
+        }
         (None, _, _) => return s.node.fault("needs node_file, or layer and node"),
     };
     Some(PlannedFlow { source, topics })
@@ -165,10 +165,7 @@ fn lanes(node: &Node<'_>) -> Option<Vec<PlannedLane>> {
 fn lane_of(s: &mut Section<'_>) -> Option<PlannedLane> {
     let layer = s.need("layer", parsed);
     let max_rate_hz = s.opt("max_rate_hz", number(0.001, MAX_RATE_HZ));
-    Some(PlannedLane {
-        layer: layer?,
-        max_rate_hz,
-    })
+    Some(PlannedLane { layer: layer?, max_rate_hz })
 }
 
 #[cfg(test)]
@@ -186,7 +183,12 @@ mod tests {
         let plan = PlanFile::read(&json!({"flows": [
             {"node_file": "robot-1.yaml", "topics": []},
             {"layer": "edge", "node": "robot-2", "bandwidth": {"limit_mbps": 40}, "topics": [
-                {"topic": "camera/front", "rate_hz": 30, "bytes": 921_600, "lanes": [{"layer": "fog"}, {"layer": "cloud", "max_rate_hz": 5}]},
+                {
+                    "topic": "camera/front",
+                    "rate_hz": 30,
+                    "bytes": 921_600,
+                    "lanes": [{"layer": "fog"}, {"layer": "cloud", "max_rate_hz": 5}],
+                },
             ]},
         ]}))
         .unwrap();
@@ -194,15 +196,9 @@ mod tests {
         let FlowSource::Inline { flow, bandwidth } = &plan.flows[1].source else {
             panic!("{plan:?}");
         };
-        assert_eq!(
-            (flow.to_string().as_str(), bandwidth.limit_mbps),
-            ("edge/robot-2", 40.0)
-        );
+        assert_eq!((flow.to_string().as_str(), bandwidth.limit_mbps), ("edge/robot-2", 40.0));
         let topic = &plan.flows[1].topics[0];
-        assert_eq!(
-            (topic.writers, topic.class, topic.lanes.len()),
-            (1, PlannedClass::Auto, 2)
-        );
+        assert_eq!((topic.writers, topic.class, topic.lanes.len()), (1, PlannedClass::Auto, 2));
         assert_eq!(topic.lanes[1].max_rate_hz, Some(5.0));
     }
 
@@ -218,7 +214,13 @@ mod tests {
             faults(&flow(json!({"node_file": "a.yaml", "bandwidth": {}, "topics": []}))),
             ["flows[0]: holds node_file and what a node file says; only one of both is allowed"]
         );
-        let topic = json!({"topic": "imu", "rate_hz": -1, "byte": 3, "bytes": 1, "lanes": [{"layer": "fog", "max_rate_hz": 0}]});
+        let topic = json!({
+            "topic": "imu",
+            "rate_hz": -1,
+            "byte": 3,
+            "bytes": 1,
+            "lanes": [{"layer": "fog", "max_rate_hz": 0}],
+        });
         let found = faults(&flow(json!({"layer": "edge", "node": "a", "topics": [topic]})));
         assert_eq!(
             found,
@@ -229,16 +231,13 @@ mod tests {
             ]
         );
         let imu = json!({"topic": "imu", "rate_hz": 1, "bytes": 1, "lanes": []});
-        let twice = faults(&flow(
-            json!({"layer": "edge", "node": "a", "topics": [imu.clone(), imu]}),
-        ));
+        let twice =
+            faults(&flow(json!({"layer": "edge", "node": "a", "topics": [imu.clone(), imu]})));
         assert_eq!(twice, ["flows[0].topics: holds imu twice; give it writers instead"]);
-        let lanes = json!([{"layer": "fog"}, {"layer": "cloud"}, {"layer": "fog", "max_rate_hz": 1}]);
+        let lanes =
+            json!([{"layer": "fog"}, {"layer": "cloud"}, {"layer": "fog", "max_rate_hz": 1}]);
         let imu = json!({"topic": "imu", "rate_hz": 1, "bytes": 1, "lanes": lanes});
         let twice = faults(&flow(json!({"layer": "edge", "node": "a", "topics": [imu]})));
-        assert_eq!(
-            twice,
-            ["flows[0].topics[0].lanes: holds fog twice; a layer gets one copy"]
-        );
+        assert_eq!(twice, ["flows[0].topics[0].lanes: holds fog twice; a layer gets one copy"]);
     }
 }

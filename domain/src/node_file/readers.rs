@@ -1,4 +1,5 @@
-//! Readers of single values: texts, numbers, words of closed sets, each with its own words for what is wrong.
+//! Readers of single values: texts, numbers, words of closed sets, each with its own words for what
+//! is wrong.
 
 use std::str::FromStr;
 
@@ -20,10 +21,9 @@ pub(super) fn text(node: &Node<'_>) -> Option<String> {
 /// Any text, also an empty one.
 pub(super) fn free_text(node: &Node<'_>) -> Option<String> {
     match node.value {
-        Value::String(text) if text.len() > MAX_TEXT_BYTES => node.fault(format!(
-            "has {} bytes, at most {MAX_TEXT_BYTES} are allowed",
-            text.len()
-        )),
+        Value::String(text) if text.len() > MAX_TEXT_BYTES => {
+            node.fault(format!("has {} bytes, at most {MAX_TEXT_BYTES} are allowed", text.len()))
+        }
         Value::String(text) if text.contains('\0') => node.fault("holds a zero byte"),
         Value::String(text) => Some(text.clone()),
         _ => node.expected("text"),
@@ -58,15 +58,14 @@ where
 /// Words of an error for a text. Errors of names do not repeat the text, those of words do.
 pub(crate) fn words(text: &str, error: &impl std::fmt::Display) -> String {
     let error = error.to_string();
-    if error.starts_with('"') {
-        error
-    } else {
-        format!("{text:?} {error}")
-    }
+    if error.starts_with('"') { error } else { format!("{text:?} {error}") }
 }
 
 /// A text with a form that only `read` knows; `wanted` says it in words.
-pub(super) fn formed<T>(wanted: &'static str, read: impl Fn(&str) -> Option<T>) -> impl Fn(&Node<'_>) -> Option<T> {
+pub(super) fn formed<T>(
+    wanted: &'static str,
+    read: impl Fn(&str) -> Option<T>,
+) -> impl Fn(&Node<'_>) -> Option<T> {
     move |node| {
         let text = text(node)?;
         read(&text).or_else(|| node.fault(format!("{text:?} is not {wanted}")))
@@ -83,11 +82,7 @@ where
         let Value::Number(number) = node.value else {
             return node.expected(&format!("a whole number from {least} to {most}"));
         };
-        match number
-            .as_u64()
-            .filter(|value| (least..=most).contains(value))
-            .map(T::try_from)
-        {
+        match number.as_u64().filter(|value| (least..=most).contains(value)).map(T::try_from) {
             Some(Ok(value)) => Some(value),
             _ => node.fault(format!("{number} is not a whole number from {least} to {most}")),
         }

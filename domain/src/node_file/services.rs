@@ -1,4 +1,5 @@
-//! Sections of the worker, the monitor and of every program: `admin`, `log`, `config`, `cache`, `database`.
+//! Sections of the worker, the monitor and of every program: `admin`, `log`, `config`, `cache`,
+//! `database`.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -36,15 +37,14 @@ impl AdminSection {
     }
 }
 
-/// A port of this machine alone: what listens is not reachable from outside unless the file says so.
+/// A port of this machine alone: what listens is not reachable from outside unless the file says
+/// so.
 pub(super) fn loopback(port: u16) -> SocketAddr {
     SocketAddr::from((Ipv4Addr::LOCALHOST, port))
 }
 
 pub(super) fn socket(node: &Node<'_>) -> Option<SocketAddr> {
-    formed("an address with a port, such as 127.0.0.1:9101", |text| {
-        text.parse().ok()
-    })(node)
+    formed("an address with a port, such as 127.0.0.1:9101", |text| text.parse().ok())(node)
 }
 
 /// How the worker reaches the main service.
@@ -70,13 +70,7 @@ impl ConfigSection {
         if cert_file.is_some() != key_file.is_some() {
             return s.node.fault("cert_file and key_file go together");
         }
-        Some(Self {
-            server: server?,
-            ca_file,
-            token_file,
-            cert_file,
-            key_file,
-        })
+        Some(Self { server: server?, ca_file, token_file, cert_file, key_file })
     }
 }
 
@@ -117,11 +111,7 @@ impl DatabaseSection {
                 let (uri, database) = mongodb(s, "blaze")?;
                 Some(Self::MongoDb { uri, database })
             }),
-            ("embedded", |s| {
-                Some(Self::Embedded {
-                    path: s.need("path", path)?,
-                })
-            }),
+            ("embedded", |s| Some(Self::Embedded { path: s.need("path", path)? })),
         ])
     }
 }

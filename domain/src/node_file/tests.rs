@@ -12,21 +12,30 @@ fn example() -> Value {
         "brokers": {
             "node": { "redis": { "url": "redis://127.0.0.1:6379", "prefix": "" } },
             "layer": { "dds": { "domain": 10, "interface": "10.0.9.1" } },
-            "inter": { "dds": { "domain": 20, "listen": "10.0.1.1", "peers": ["10.0.3.1"], "peer_slots": 4,
+            "inter": { "dds": { "domain": 20, "listen": "10.0.1.1", "peers": ["10.0.3.1"],
+                "peer_slots": 4,
                                 "mtu": 1500, "chunking": "auto" } },
-            "plugins": [ { "ros2": { "domain": 0, "distro": "jazzy", "allow": ["**"], "deny": [] } } ],
+            "plugins": [ { "ros2": { "domain": 0, "distro": "jazzy", "allow": ["**"],
+                "deny": [] } } ],
         },
-        "admin": { "flow": "127.0.0.1:9101", "worker": "127.0.0.1:9102", "monitor": "127.0.0.1:9103" },
+        "admin": {
+            "flow": "127.0.0.1:9101",
+            "worker": "127.0.0.1:9102",
+            "monitor": "127.0.0.1:9103",
+        },
         "config": { "server": "https://10.0.3.1:50051", "ca_file": "/etc/blaze/ca.pem",
                     "token_file": "/etc/blaze/token" },
         "cache": { "redis": { "url": "redis://127.0.0.1:6379", "prefix": "" } },
         "database": { "mongodb": { "uri": "mongodb://127.0.0.1:27017", "database": "blaze" } },
         "flow": {
-            "bandwidth": { "limit_mbps": 150, "per_message_share": 0.95, "overhead": 1.02, "min_rate_hz": 2,
-                           "large_bytes": 65536, "share": "paper", "wire_overhead": "measured", "adaptive": true,
+            "bandwidth": { "limit_mbps": 150, "per_message_share": 0.95, "overhead": 1.02,
+                "min_rate_hz": 2,
+                           "large_bytes": 65536, "share": "paper", "wire_overhead": "measured",
+                           "adaptive": true,
                            "links": { "cloud": { "limit_mbps": 40 } } },
             "compression": { "codec": "lz4", "level": 10, "min_bytes": 65536 },
-            "topics": [ { "match": "camera/**", "priority": "bulk", "max_rate_hz": 15, "lifespan_ms": 500,
+            "topics": [ { "match": "camera/**", "priority": "bulk", "max_rate_hz": 15,
+                "lifespan_ms": 500,
                           "compression": { "level": 9 } } ],
             "pool_threads": 0,
             "gateway": "auto",
@@ -42,23 +51,39 @@ fn control_plane() -> Value {
         "rest": { "listen": "127.0.0.1:8080" },
         "grpc": { "listen": "127.0.0.1:50051", "reflection": false },
         "admin": { "listen": "127.0.0.1:9104" },
-        "tls": { "cert_file": "c.pem", "key_file": "k.pem", "client_ca_file": "a.pem", "allow_plaintext": false },
+        "tls": {
+            "cert_file": "c.pem",
+            "key_file": "k.pem",
+            "client_ca_file": "a.pem",
+            "allow_plaintext": false,
+        },
         "store": { "sqlite": { "path": "./blaze-config.db" } },
         "auth": { "issuer": "blaze", "audience": "blaze-config",
-                  "keys": [ { "id": "k1", "alg": "HS256", "file": "/etc/blaze/jwt.key", "sign": true } ],
+                  "keys": [{
+                      "id": "k1",
+                      "alg": "HS256",
+                      "file": "/etc/blaze/jwt.key",
+                      "sign": true,
+                  }],
                   "jwks": { "url": "https://idp/jwks", "refresh_s": 300 } },
         "encryption": { "keys": [ { "id": "e1", "file": "/etc/blaze/enc.key" } ] },
-        "history": { "keep_revisions": 100000, "keep_s": 2592000, "keep_versions": 20, "trim_period_s": 60 },
-        "limits": { "in_flight": 512, "watches_per_subject": 1000, "requests_per_s": 0, "auth_failures_per_s": 10 },
+        "history": {
+            "keep_revisions": 100000,
+            "keep_s": 2592000,
+            "keep_versions": 20,
+            "trim_period_s": 60,
+        },
+        "limits": {
+            "in_flight": 512,
+            "watches_per_subject": 1000,
+            "requests_per_s": 0,
+            "auth_failures_per_s": 10,
+        },
     })
 }
 
 fn faults(tree: &Value) -> Vec<String> {
-    NodeFile::read(tree)
-        .unwrap_err()
-        .iter()
-        .map(ToString::to_string)
-        .collect()
+    NodeFile::read(tree).unwrap_err().iter().map(ToString::to_string).collect()
 }
 
 #[test]
@@ -67,16 +92,10 @@ fn the_example_is_read_whole() {
     assert_eq!(file.flow_id().unwrap().to_string(), "edge/robot-1");
     assert_eq!(file.layer.as_ref().unwrap().kind, LayerKind::Edge);
     let inter = file.brokers.inter.as_ref().unwrap();
-    assert_eq!(
-        (inter.domain, inter.peers.len(), inter.peer_slots, inter.mtu),
-        (20, 1, 4, 1500)
-    );
+    assert_eq!((inter.domain, inter.peers.len(), inter.peer_slots, inter.mtu), (20, 1, 4, 1500));
     assert_eq!(file.flow.bandwidth.limit_bytes_per_s(), 150.0 * 131_072.0);
     let cloud = "cloud".parse().unwrap();
-    assert_eq!(
-        file.flow.bandwidth.link_limit_bytes_per_s(&cloud),
-        Some(40.0 * 131_072.0)
-    );
+    assert_eq!(file.flow.bandwidth.link_limit_bytes_per_s(&cloud), Some(40.0 * 131_072.0));
     assert_eq!(file.state_dir.as_deref(), Some(std::path::Path::new("/var/lib/blaze")));
     assert!(file.check_for_flow().is_empty());
     let places: Vec<&str> = warnings.iter().map(|warning| warning.path.as_str()).collect();
@@ -125,17 +144,13 @@ fn an_empty_file_has_the_documented_defaults() {
     );
     assert_eq!(
         file.flow.compression,
-        Compression {
-            codec: Codec::Lz4,
-            level: 10,
-            min_bytes: 65_536,
-            adaptive: true
-        }
+        Compression { codec: Codec::Lz4, level: 10, min_bytes: 65_536, adaptive: true }
     );
     assert_eq!(file.admin.flow.to_string(), "127.0.0.1:9101");
     assert_eq!(file.control_plane.grpc.listen.to_string(), "127.0.0.1:50051");
     assert_eq!((file.log.level.as_str(), file.worker.lease_ms), ("info", 5000));
-    let missing: Vec<String> = file.check_for_flow().iter().map(|fault| fault.path.clone()).collect();
+    let missing: Vec<String> =
+        file.check_for_flow().iter().map(|fault| fault.path.clone()).collect();
     assert_eq!(missing, ["layer", "node", "brokers"]);
 }
 
@@ -143,8 +158,10 @@ fn an_empty_file_has_the_documented_defaults() {
 fn the_sections_of_the_main_service_are_read() {
     let tree = json!({
         "control_plane": control_plane(),
-        "worker": { "defaults_file": "/etc/blaze/defaults.yaml", "state_dir": "/var/lib/blaze/worker",
-                    "key_file": "/etc/blaze/worker.key", "deliver_secrets": "auto", "lease_ms": 5000 },
+        "worker": { "defaults_file": "/etc/blaze/defaults.yaml",
+            "state_dir": "/var/lib/blaze/worker",
+                    "key_file": "/etc/blaze/worker.key", "deliver_secrets": "auto",
+                    "lease_ms": 5000 },
     });
     let (file, warnings) = NodeFile::read(&tree).unwrap();
     let auth = file.control_plane.auth.unwrap();
@@ -161,9 +178,11 @@ fn all_faults_come_at_once() {
         "brokers": {
             "node": { "redis": { "prefix": "a b" }, "memory": {} },
             "layer": {},
-            "inter": { "dds": { "domain": 101, "listen": "here", "peers": ["10.0.0.1", 7], "mtu": 1279 } },
+            "inter": { "dds": { "domain": 101, "listen": "here", "peers": ["10.0.0.1", 7],
+                "mtu": 1279 } },
         },
-        "flow": { "bandwidth": { "limit_mbps": "fast", "limit_mbs": 3, "links": { "Cloud": { "limit_mbps": 0 } } },
+        "flow": { "bandwidth": { "limit_mbps": "fast", "limit_mbs": 3,
+            "links": { "Cloud": { "limit_mbps": 0 } } },
                   "topics": [ { "match": "a*/b" }, { "priority": "urgent" }, 5 ],
                   "gateway": "perhaps" },
         "log": { "level": "loud" },
@@ -186,12 +205,14 @@ fn all_faults_come_at_once() {
             "flow.bandwidth.links.Cloud: the name of a layer holds 'C'; allowed are a-z, 0-9 and -",
             "flow.bandwidth.links.Cloud.limit_mbps: 0 is not between 0.001 and 1000000",
             "flow.bandwidth.limit_mbs: unknown key; did you mean limit_mbps?",
-            "flow.topics[0].match: \"a*/b\" has a star inside \"a*\": `*` and `**` stand for whole segments",
+            "flow.topics[0].match: \"a*/b\" has a star inside \"a*\": `*` and `**` stand for whole \
+             segments",
             "flow.topics[1].match: is required",
             "flow.topics[1].priority: \"urgent\" is not one of control, state, bulk",
             "flow.topics[2]: expected a mapping, found the number 5",
             "flow.gateway: expected auto, true or false, found text",
-            "log.level: \"loud\" is not error, warn, info, debug, trace, off, or directives such as \
+            "log.level: \"loud\" is not error, warn, info, debug, trace, off, or directives such \
+             as \
              info,blaze_flow=debug",
             "state_dir: expected text, found the number 7; put it in quotes",
             "ndoe: unknown key; did you mean node?",
@@ -207,8 +228,10 @@ fn domains_differ() {
     assert_eq!(
         faults(&tree),
         [
-            "brokers.inter.dds.domain: 10 is also brokers.layer.dds.domain; all DDS domains of a node file differ",
-            "brokers.plugins[1].ros2.domain: 10 is also brokers.layer.dds.domain; all DDS domains of a node file differ",
+            "brokers.inter.dds.domain: 10 is also brokers.layer.dds.domain; all DDS domains of a \
+             node file differ",
+            "brokers.plugins[1].ros2.domain: 10 is also brokers.layer.dds.domain; all DDS domains \
+             of a node file differ",
         ]
     );
 }
@@ -219,12 +242,11 @@ fn secrets_are_not_repeated() {
     assert_eq!(faults(&tree).len(), 1);
     assert!(!faults(&tree)[0].contains("geheim"));
     let tree = json!({ "cache": { "redis": { "url": "redis://user:geheim@host" } },
-        "brokers": { "layer": { "kafka": { "bootstrap": ["h:1"], "properties": { "sasl.password": "geheim" } } } } });
+        "brokers": { "layer": { "kafka": { "bootstrap": ["h:1"],
+            "properties": { "sasl.password": "geheim" } } } } });
     let (file, _) = NodeFile::read(&tree).unwrap();
     assert!(!format!("{file:?}").contains("geheim"));
-    let Some(LayerBroker::Kafka(kafka)) = file.brokers.layer else {
-        panic!("kafka")
-    };
+    let Some(LayerBroker::Kafka(kafka)) = file.brokers.layer else { panic!("kafka") };
     assert_eq!(kafka.properties["sasl.password"].reveal(), "geheim");
 }
 
@@ -232,7 +254,12 @@ fn secrets_are_not_repeated() {
 fn the_first_rule_that_gives_a_value_wins() {
     let tree = json!({ "flow": { "compression": { "level": 3 }, "topics": [
         { "match": "camera/*", "max_rate_hz": 15, "compression": { "level": 9 } },
-        { "match": "camera/**", "max_rate_hz": 5, "priority": "bulk", "compression": { "codec": "none" } },
+        {
+            "match": "camera/**",
+            "max_rate_hz": 5,
+            "priority": "bulk",
+            "compression": { "codec": "none" },
+        },
     ] } });
     let (file, _) = NodeFile::read(&tree).unwrap();
     let settings = |topic: &str| file.flow.topic(&topic.parse::<TopicName>().unwrap());
@@ -248,10 +275,7 @@ fn the_first_rule_that_gives_a_value_wins() {
     let cmd = TopicValues::of(&unbound.flow.topics, &"cmd".parse().unwrap());
     assert_eq!((cmd.lifespan_ms, cmd.max_rate_hz), (Some(0), Some(15.0)));
     let other = settings("imu");
-    assert_eq!(
-        (other.max_rate_hz, other.priority, other.compression.level),
-        (None, None, 3)
-    );
+    assert_eq!((other.max_rate_hz, other.priority, other.compression.level), (None, None, 3));
 }
 
 #[test]
@@ -259,18 +283,10 @@ fn a_tree_that_is_no_mapping_is_refused() {
     for tree in [json!([]), json!("x"), json!(3)] {
         assert_eq!(NodeFile::read(&tree).unwrap_err().len(), 1, "{tree}");
     }
-    for (section, found) in [
-        ("flow", 1),
-        ("admin", 1),
-        ("control_plane", 1),
-        ("brokers", 1),
-        ("layer", 1),
-    ] {
-        assert_eq!(
-            NodeFile::read(&json!({ section: 5 })).unwrap_err().len(),
-            found,
-            "{section}"
-        );
+    for (section, found) in
+        [("flow", 1), ("admin", 1), ("control_plane", 1), ("brokers", 1), ("layer", 1)]
+    {
+        assert_eq!(NodeFile::read(&json!({ section: 5 })).unwrap_err().len(), found, "{section}");
     }
 }
 
@@ -312,8 +328,10 @@ mod any_tree {
         leaf.prop_recursive(5, 64, 6, move |inner| {
             prop_oneof![
                 prop::collection::vec(inner.clone(), 0..4).prop_map(Value::from),
-                prop::collection::vec((keys.clone(), inner), 0..6)
-                    .prop_map(|pairs| pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()),
+                prop::collection::vec((keys.clone(), inner), 0..6).prop_map(|pairs| pairs
+                    .into_iter()
+                    .map(|(key, value)| (key.to_owned(), value))
+                    .collect()),
             ]
         })
     }

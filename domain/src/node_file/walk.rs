@@ -1,8 +1,9 @@
-//! Reads a tree of values into types and collects every fault on the way, instead of stopping at the first.
+//! Reads a tree of values into types and collects every fault on the way, instead of stopping at
+//! the first.
 //!
-//! A [`Section`] is one mapping of the file. Each of its methods reads one key and remembers that the key is known; what
-//! is left over at the end is refused. A reader is a function `&Node -> Option<T>` that reports what is wrong and
-//! answers `None`.
+//! A [`Section`] is one mapping of the file. Each of its methods reads one key and remembers that
+//! the key is known; what is left over at the end is refused. A reader is a function `&Node ->
+//! Option<T>` that reports what is wrong and answers `None`.
 
 use std::cell::RefCell;
 
@@ -30,11 +31,7 @@ pub(super) struct Node<'v> {
 
 impl<'v> Node<'v> {
     pub(super) fn root(value: &'v Value, report: &'v Report) -> Self {
-        Self {
-            path: String::new(),
-            value,
-            report,
-        }
+        Self { path: String::new(), value, report }
     }
 
     /// The same report, another place.
@@ -44,18 +41,18 @@ impl<'v> Node<'v> {
 
     /// Reports a fault of this value; answers `None` so that a reader can end with it.
     pub(super) fn fault<T>(&self, detail: impl Into<String>) -> Option<T> {
-        self.report.faults.borrow_mut().push(Fault {
-            path: self.path.clone(),
-            detail: detail.into(),
-        });
+        self.report
+            .faults
+            .borrow_mut()
+            .push(Fault { path: self.path.clone(), detail: detail.into() });
         None
     }
 
     pub(super) fn warn(&self, detail: impl Into<String>) {
-        self.report.warnings.borrow_mut().push(Warning {
-            path: self.path.clone(),
-            detail: detail.into(),
-        });
+        self.report
+            .warnings
+            .borrow_mut()
+            .push(Warning { path: self.path.clone(), detail: detail.into() });
     }
 
     /// Reports that the value is of another type than `wanted`.
@@ -68,16 +65,9 @@ impl<'v> Node<'v> {
     }
 
     fn child(&self, key: &str, value: &'v Value) -> Self {
-        let path = if self.path.is_empty() {
-            key.to_owned()
-        } else {
-            format!("{}.{key}", self.path)
-        };
-        Self {
-            path,
-            value,
-            report: self.report,
-        }
+        let path =
+            if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) };
+        Self { path, value, report: self.report }
     }
 
     /// The value as a mapping; `null` is an empty one.
@@ -89,11 +79,7 @@ impl<'v> Node<'v> {
                 return self.expected("a mapping");
             }
         };
-        let mut section = Section {
-            node: self.clone(),
-            map,
-            known: Vec::new(),
-        };
+        let mut section = Section { node: self.clone(), map, known: Vec::new() };
         let out = read(&mut section);
         section.refuse_unknown();
         Some(out)
@@ -108,12 +94,13 @@ impl<'v> Node<'v> {
             return Vec::new();
         };
         if map.len() > MAX_ENTRIES {
-            self.fault::<()>(format!("has {} entries, at most {MAX_ENTRIES} are allowed", map.len()));
+            self.fault::<()>(format!(
+                "has {} entries, at most {MAX_ENTRIES} are allowed",
+                map.len()
+            ));
             return Vec::new();
         }
-        map.iter()
-            .map(|(key, value)| (key.as_str(), self.child(key, value)))
-            .collect()
+        map.iter().map(|(key, value)| (key.as_str(), self.child(key, value))).collect()
     }
 
     /// The value as a list; entries that cannot be read are reported and left out.
@@ -122,17 +109,11 @@ impl<'v> Node<'v> {
             return self.expected("a list");
         };
         if items.len() > MAX_ENTRIES {
-            return self.fault(format!(
-                "has {} entries, at most {MAX_ENTRIES} are allowed",
-                items.len()
-            ));
+            return self
+                .fault(format!("has {} entries, at most {MAX_ENTRIES} are allowed", items.len()));
         }
         let item = |(index, value)| {
-            read(&Node {
-                path: format!("{}[{index}]", self.path),
-                value,
-                report: self.report,
-            })
+            read(&Node { path: format!("{}[{index}]", self.path), value, report: self.report })
         };
         Some(items.iter().enumerate().filter_map(item).collect())
     }
@@ -148,25 +129,34 @@ pub(super) struct Section<'v> {
 impl<'v> Section<'v> {
     fn get(&mut self, key: &'static str) -> Option<Node<'v>> {
         self.known.push(key);
-        self.map
-            .and_then(|map| map.get(key))
-            .map(|value| self.node.child(key, value))
+        self.map.and_then(|map| map.get(key)).map(|value| self.node.child(key, value))
     }
 
     /// The value of a key that may be missing; `null` is missing.
-    pub(super) fn opt<T>(&mut self, key: &'static str, read: impl FnOnce(&Node<'v>) -> Option<T>) -> Option<T> {
-        self.get(key)
-            .filter(|node| !node.value.is_null())
-            .and_then(|node| read(&node))
+    pub(super) fn opt<T>(
+        &mut self,
+        key: &'static str,
+        read: impl FnOnce(&Node<'v>) -> Option<T>,
+    ) -> Option<T> {
+        self.get(key).filter(|node| !node.value.is_null()).and_then(|node| read(&node))
     }
 
     /// The value of a key, or its default.
-    pub(super) fn or<T>(&mut self, key: &'static str, read: impl FnOnce(&Node<'v>) -> Option<T>, default: T) -> T {
+    pub(super) fn or<T>(
+        &mut self,
+        key: &'static str,
+        read: impl FnOnce(&Node<'v>) -> Option<T>,
+        default: T,
+    ) -> T {
         self.opt(key, read).unwrap_or(default)
     }
 
     /// The value of a key that must be there.
-    pub(super) fn need<T>(&mut self, key: &'static str, read: impl FnOnce(&Node<'v>) -> Option<T>) -> Option<T> {
+    pub(super) fn need<T>(
+        &mut self,
+        key: &'static str,
+        read: impl FnOnce(&Node<'v>) -> Option<T>,
+    ) -> Option<T> {
         let Some(node) = self.get(key).filter(|node| !node.value.is_null()) else {
             return self.node.child(key, &Value::Null).fault("is required");
         };
@@ -174,17 +164,29 @@ impl<'v> Section<'v> {
     }
 
     /// A list that may be missing: then it is empty.
-    pub(super) fn list<T>(&mut self, key: &'static str, read: impl Fn(&Node<'v>) -> Option<T>) -> Vec<T> {
+    pub(super) fn list<T>(
+        &mut self,
+        key: &'static str,
+        read: impl Fn(&Node<'v>) -> Option<T>,
+    ) -> Vec<T> {
         self.opt(key, |node| node.list(read)).unwrap_or_default()
     }
 
     /// A nested section that may be missing.
-    pub(super) fn sub<T>(&mut self, key: &'static str, read: impl FnOnce(&mut Section<'v>) -> Option<T>) -> Option<T> {
+    pub(super) fn sub<T>(
+        &mut self,
+        key: &'static str,
+        read: impl FnOnce(&mut Section<'v>) -> Option<T>,
+    ) -> Option<T> {
         self.opt(key, |node| node.section(read).flatten())
     }
 
     /// A nested section that reads like an empty one when it is missing.
-    pub(super) fn sub_or_empty<T>(&mut self, key: &'static str, read: impl FnOnce(&mut Section<'v>) -> T) -> T {
+    pub(super) fn sub_or_empty<T>(
+        &mut self,
+        key: &'static str,
+        read: impl FnOnce(&mut Section<'v>) -> T,
+    ) -> T {
         let given = self.get(key);
         let map = given.as_ref().and_then(|node| match node.value {
             Value::Object(map) => Some(map),
@@ -192,17 +194,14 @@ impl<'v> Section<'v> {
             _ => node.expected("a mapping"),
         });
         let node = given.unwrap_or_else(|| self.node.child(key, &Value::Null));
-        let mut section = Section {
-            node,
-            map,
-            known: Vec::new(),
-        };
+        let mut section = Section { node, map, known: Vec::new() };
         let out = read(&mut section);
         section.refuse_unknown();
         out
     }
 
-    /// Exactly one of several keys, each with a section of its own; `null` is an empty section here.
+    /// Exactly one of several keys, each with a section of its own; `null` is an empty section
+    /// here.
     pub(super) fn one_of<T>(&mut self, choices: &[Choice<'v, T>]) -> Option<T> {
         let names = choices.iter().map(|(key, _)| *key).collect::<Vec<_>>().join(", ");
         let mut given = Vec::new();
@@ -213,9 +212,7 @@ impl<'v> Section<'v> {
         }
         if given.len() > 1 {
             let found = given.iter().map(|(key, _)| *key).collect::<Vec<_>>().join(" and ");
-            return self
-                .node
-                .fault(format!("holds {found}; only one of {names} is allowed"));
+            return self.node.fault(format!("holds {found}; only one of {names} is allowed"));
         }
         match given.pop() {
             Some((_, value)) => value,
@@ -233,9 +230,7 @@ impl<'v> Section<'v> {
                 None if self.known.is_empty() => "; nothing is known here".to_owned(),
                 None => format!("; known are {}", self.known.join(", ")),
             };
-            self.node
-                .child(key, &Value::Null)
-                .fault::<()>(format!("unknown key{hint}"));
+            self.node.child(key, &Value::Null).fault::<()>(format!("unknown key{hint}"));
         }
     }
 }
@@ -243,11 +238,7 @@ impl<'v> Section<'v> {
 /// What a section reads when nothing is given: the one source of its defaults.
 pub(super) fn from_empty<T>(read: fn(&mut Section<'_>) -> T) -> T {
     let report = Report::default();
-    read(&mut Section {
-        node: Node::root(&Value::Null, &report),
-        map: None,
-        known: Vec::new(),
-    })
+    read(&mut Section { node: Node::root(&Value::Null, &report), map: None, known: Vec::new() })
 }
 
 /// A key and how its section is read.

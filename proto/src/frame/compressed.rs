@@ -5,16 +5,17 @@
 //!                         ◄─decompressed─
 //! ```
 //!
-//! The two fields are put behind the others and cut out again, so that the header that comes back is, byte for byte,
-//! the one that went in: with fields that this version does not know, and in the order that another implementation
-//! chose.
+//! The two fields are put behind the others and cut out again, so that the header that comes back
+//! is, byte for byte, the one that went in: with fields that this version does not know, and in the
+//! order that another implementation chose.
 
 use std::ops::Range;
 
 use blaze_domain::{MAX_HEADER_BYTES, MAX_PAYLOAD_BYTES};
 use bytes::{BufMut, Bytes, BytesMut};
 use prost::encoding::{
-    DecodeContext, WireType, decode_key, encode_key, encode_varint, encoded_len_varint, key_len, skip_field,
+    DecodeContext, WireType, decode_key, encode_key, encode_varint, encoded_len_varint, key_len,
+    skip_field,
 };
 
 use super::{Frame, FrameError, MAGIC, PREFIX_BYTES};
@@ -34,7 +35,8 @@ pub enum Compression {
     None,
     /// One LZ4 block without a size of its own; [`Frame::uncompressed_bytes`] has it.
     Lz4Block,
-    /// In a way that this version does not know: the number in the header, or the largest one if that has no 32 bits.
+    /// In a way that this version does not know: the number in the header, or the largest one if
+    /// that has no 32 bits.
     Unknown(i32),
 }
 
@@ -49,34 +51,33 @@ impl Frame {
         }
     }
 
-    /// Bytes of the payload before it was compressed, as the sender says; 0 where it is not compressed. Any number may
-    /// stand there: it is to be checked before memory is taken for it.
+    /// Bytes of the payload before it was compressed, as the sender says; 0 where it is not
+    /// compressed. Any number may stand there: it is to be checked before memory is taken for it.
     #[must_use]
     pub fn uncompressed_bytes(&self) -> u64 {
         self.index.uncompressed_bytes
     }
 
-    /// The same message with its payload as an LZ4 block that was `uncompressed_bytes` long. Hops and age stay beside
-    /// it.
+    /// The same message with its payload as an LZ4 block that was `uncompressed_bytes` long. Hops
+    /// and age stay beside it.
     ///
     /// # Errors
-    /// [`FrameError::HeaderTooLarge`] if the header has no room for the two fields (at most 7 bytes): then the message
-    /// goes as it is. [`FrameError::Field`] if it is compressed already, [`FrameError::PayloadTooLarge`] if one of the
-    /// sizes is not allowed.
+    /// [`FrameError::HeaderTooLarge`] if the header has no room for the two fields (at most 7
+    /// bytes): then the message goes as it is. [`FrameError::Field`] if it is compressed already,
+    /// [`FrameError::PayloadTooLarge`] if one of the sizes is not allowed.
     pub fn compressed(&self, payload: Bytes, uncompressed_bytes: u64) -> Result<Self, FrameError> {
         if self.is_compressed() {
-            return Err(FrameError::Field {
-                field: "compression",
-                reason: "is set already",
-            });
+            return Err(FrameError::Field { field: "compression", reason: "is set already" });
         }
         let uncompressed = usize::try_from(uncompressed_bytes).unwrap_or(usize::MAX);
         if uncompressed > MAX_PAYLOAD_BYTES {
             return Err(FrameError::PayloadTooLarge(uncompressed));
         }
         let header = &self.head[PREFIX_BYTES..];
-        let added =
-            key_len(COMPRESSION_TAG) + 1 + key_len(UNCOMPRESSED_BYTES_TAG) + encoded_len_varint(uncompressed_bytes);
+        let added = key_len(COMPRESSION_TAG)
+            + 1
+            + key_len(UNCOMPRESSED_BYTES_TAG)
+            + encoded_len_varint(uncompressed_bytes);
         let mut head = begin(header.len() + added)?;
         head.put_slice(header);
         // Written even if it is 0, so that what is cut out again is what was added.
@@ -87,17 +88,15 @@ impl Frame {
         self.with_head(head, payload)
     }
 
-    /// The same message with its payload as it was before [`Frame::compressed`]. Hops and age stay beside it.
+    /// The same message with its payload as it was before [`Frame::compressed`]. Hops and age stay
+    /// beside it.
     ///
     /// # Errors
-    /// [`FrameError::Field`] if it is not an LZ4 block, says so twice, or announced another size than that of
-    /// `payload`; [`FrameError::PayloadTooLarge`].
+    /// [`FrameError::Field`] if it is not an LZ4 block, says so twice, or announced another size
+    /// than that of `payload`; [`FrameError::PayloadTooLarge`].
     pub fn decompressed(&self, payload: Bytes) -> Result<Self, FrameError> {
         if self.compression() != Compression::Lz4Block {
-            return Err(FrameError::Field {
-                field: "compression",
-                reason: "is not LZ4_BLOCK",
-            });
+            return Err(FrameError::Field { field: "compression", reason: "is not LZ4_BLOCK" });
         }
         if payload.len() as u64 != self.uncompressed_bytes() {
             return Err(FrameError::Field {
@@ -108,7 +107,8 @@ impl Frame {
         let header = &self.head[PREFIX_BYTES..];
         let mut cuts = places(header)?;
         cuts.sort_by_key(|cut| cut.start);
-        let mut head = begin(header.len() - cuts.iter().map(ExactSizeIterator::len).sum::<usize>())?;
+        let mut head =
+            begin(header.len() - cuts.iter().map(ExactSizeIterator::len).sum::<usize>())?;
         let mut from = 0;
         for cut in cuts.iter().filter(|cut| !cut.is_empty()) {
             head.put_slice(&header[from..cut.start]);
@@ -118,10 +118,7 @@ impl Frame {
         let frame = self.with_head(head, payload)?;
         if frame.is_compressed() {
             // Each new reading of it would be compressed once more.
-            return Err(FrameError::Field {
-                field: "compression",
-                reason: "is given twice",
-            });
+            return Err(FrameError::Field { field: "compression", reason: "is given twice" });
         }
         Ok(frame)
     }
@@ -133,7 +130,8 @@ impl Frame {
 
 /// A prefix for a header of so many bytes, with room for it.
 fn begin(header_bytes: usize) -> Result<BytesMut, FrameError> {
-    let length = u32::try_from(header_bytes).map_err(|_| FrameError::HeaderTooLarge(header_bytes))?;
+    let length =
+        u32::try_from(header_bytes).map_err(|_| FrameError::HeaderTooLarge(header_bytes))?;
     if header_bytes > MAX_HEADER_BYTES {
         return Err(FrameError::HeaderTooLarge(header_bytes));
     }
@@ -143,14 +141,15 @@ fn begin(header_bytes: usize) -> Result<BytesMut, FrameError> {
     Ok(head)
 }
 
-/// Where the last `compression` and the last `uncompressed_bytes` stand; of several the last one counts, and is the one
-/// that [`Frame::compressed`] has added. Empty where there is none.
+/// Where the last `compression` and the last `uncompressed_bytes` stand; of several the last one
+/// counts, and is the one that [`Frame::compressed`] has added. Empty where there is none.
 fn places(header: &[u8]) -> Result<[Range<usize>; 2], FrameError> {
     let mut places = [0..0, 0..0];
     let mut rest = header;
     while !rest.is_empty() {
         let start = header.len() - rest.len();
-        let (tag, wire_type) = decode_key(&mut rest).map_err(|error| FrameError::Header(error.to_string()))?;
+        let (tag, wire_type) =
+            decode_key(&mut rest).map_err(|error| FrameError::Header(error.to_string()))?;
         skip_field(wire_type, tag, &mut rest, DecodeContext::default())
             .map_err(|error| FrameError::Header(error.to_string()))?;
         let place = start..header.len() - rest.len();

@@ -41,7 +41,13 @@ pub struct Header {
 impl Header {
     /// A header with the parts that every message has; the rest is empty, absent or zero.
     #[must_use]
-    pub fn new(topic: &str, origin: Origin, writer: WriterId, sequence: u64, publish_time_ns: u64) -> Self {
+    pub fn new(
+        topic: &str,
+        origin: Origin,
+        writer: WriterId,
+        sequence: u64,
+        publish_time_ns: u64,
+    ) -> Self {
         Self {
             topic: topic.to_owned(),
             origin,

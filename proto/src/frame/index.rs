@@ -59,7 +59,8 @@ impl Fields<'_> {
     fn varint(&mut self) -> Result<u64, FrameError> {
         let mut rest = &self.whole[self.at..self.end];
         let before = rest.len();
-        let value = decode_varint(&mut rest).map_err(|error| FrameError::Header(error.to_string()))?;
+        let value =
+            decode_varint(&mut rest).map_err(|error| FrameError::Header(error.to_string()))?;
         self.at += before - rest.len();
         Ok(value)
     }
@@ -67,10 +68,7 @@ impl Fields<'_> {
     fn take(&mut self, count: usize) -> Result<Range<u16>, FrameError> {
         let needed = self.at.saturating_add(count);
         if needed > self.end {
-            return Err(FrameError::Truncated {
-                found: self.end,
-                needed,
-            });
+            return Err(FrameError::Truncated { found: self.end, needed });
         }
         // The header has at most 4096 bytes.
         let narrow = |at: usize| u16::try_from(at).map_err(|_| FrameError::HeaderTooLarge(at));
@@ -85,7 +83,8 @@ impl Fields<'_> {
         }
         let mut rest = &self.whole[self.at..self.end];
         let before = rest.len();
-        let (tag, wire_type) = decode_key(&mut rest).map_err(|error| FrameError::Header(error.to_string()))?;
+        let (tag, wire_type) =
+            decode_key(&mut rest).map_err(|error| FrameError::Header(error.to_string()))?;
         self.at += before - rest.len();
         let value = match wire_type {
             WireType::Varint => Value::Varint(self.varint()?),
@@ -99,7 +98,8 @@ impl Fields<'_> {
             }
             WireType::LengthDelimited => {
                 let length = self.varint()?;
-                let length = usize::try_from(length).map_err(|_| FrameError::HeaderTooLarge(usize::MAX))?;
+                let length =
+                    usize::try_from(length).map_err(|_| FrameError::HeaderTooLarge(usize::MAX))?;
                 Value::Bytes(self.take(length)?)
             }
             WireType::StartGroup | WireType::EndGroup => {
@@ -114,11 +114,7 @@ impl Index {
     pub(super) fn read(header: &[u8]) -> Result<Self, FrameError> {
         let mut index = Self::default();
         let mut has_writer = false;
-        let mut fields = Fields {
-            whole: header,
-            at: 0,
-            end: header.len(),
-        };
+        let mut fields = Fields { whole: header, at: 0, end: header.len() };
         loop {
             let start = fields.at;
             let Some((tag, value)) = fields.next()? else { break };
@@ -136,9 +132,13 @@ impl Index {
                 (4, Value::Varint(value)) => index.sequence = value,
                 (5, Value::Fixed64(value)) => index.publish_time_ns = value,
                 (6, Value::Bytes(place)) => index.encoding = utf8(header, place, "encoding")?,
-                (7, Value::Varint(value)) => index.compression = i32::try_from(value).unwrap_or(i32::MAX),
+                (7, Value::Varint(value)) => {
+                    index.compression = i32::try_from(value).unwrap_or(i32::MAX)
+                }
                 (8, Value::Varint(value)) => index.uncompressed_bytes = value,
-                (9, Value::Varint(value)) => index.lifespan_ms = u32::try_from(value).unwrap_or(u32::MAX),
+                (9, Value::Varint(value)) => {
+                    index.lifespan_ms = u32::try_from(value).unwrap_or(u32::MAX)
+                }
                 (10, Value::Varint(value)) => index.priority = i32::try_from(value).unwrap_or(0),
                 (11, Value::Bytes(place)) => index.type_hash = utf8(header, place, "type_hash")?,
                 (HOPS_TAG, Value::Varint(value)) => {
@@ -151,9 +151,13 @@ impl Index {
                     index.encoded_age_us = value;
                     index.age_at = place_of(start, fields.at)?;
                 }
-                (14, Value::Bytes(place)) => index.traceparent = utf8(header, place, "traceparent")?,
+                (14, Value::Bytes(place)) => {
+                    index.traceparent = utf8(header, place, "traceparent")?
+                }
                 (15, Value::Varint(value)) => index.reliable = value != 0,
-                (16, Value::Varint(value)) => index.depth = u32::try_from(value).unwrap_or(u32::MAX),
+                (16, Value::Varint(value)) => {
+                    index.depth = u32::try_from(value).unwrap_or(u32::MAX)
+                }
                 (1..=16, _) => {
                     return Err(FrameError::Header(format!("field {tag} has the wrong wire type")));
                 }
@@ -161,33 +165,20 @@ impl Index {
             }
         }
         if !has_writer {
-            return Err(FrameError::Field {
-                field: "writer",
-                reason: "is missing",
-            });
+            return Err(FrameError::Field { field: "writer", reason: "is missing" });
         }
         if index.sequence == 0 {
-            return Err(FrameError::Field {
-                field: "sequence",
-                reason: "must be 1 or more",
-            });
+            return Err(FrameError::Field { field: "sequence", reason: "must be 1 or more" });
         }
         if index.topic.is_empty() {
-            return Err(FrameError::Field {
-                field: "topic",
-                reason: "is missing",
-            });
+            return Err(FrameError::Field { field: "topic", reason: "is missing" });
         }
         Ok(index)
     }
 
     fn read_origin(&mut self, header: &[u8], place: &Range<u16>) -> Result<(), FrameError> {
         let place = usize_range(place);
-        let mut fields = Fields {
-            whole: header,
-            at: place.start,
-            end: place.end,
-        };
+        let mut fields = Fields { whole: header, at: place.start, end: place.end };
         while let Some((tag, value)) = fields.next()? {
             match (tag, value) {
                 (1, Value::Bytes(place)) => self.layer = utf8(header, place, "origin.layer")?,
@@ -208,10 +199,8 @@ impl Index {
 }
 
 fn utf8(header: &[u8], place: Range<u16>, field: &'static str) -> Result<Range<u16>, FrameError> {
-    std::str::from_utf8(&header[usize_range(&place)]).map_err(|_| FrameError::Field {
-        field,
-        reason: "is not UTF-8",
-    })?;
+    std::str::from_utf8(&header[usize_range(&place)])
+        .map_err(|_| FrameError::Field { field, reason: "is not UTF-8" })?;
     Ok(place)
 }
 
@@ -220,10 +209,7 @@ fn refuse_repeat(place: &Range<u16>, field: &'static str) -> Result<(), FrameErr
     if place.is_empty() {
         Ok(())
     } else {
-        Err(FrameError::Field {
-            field,
-            reason: "is given twice",
-        })
+        Err(FrameError::Field { field, reason: "is given twice" })
     }
 }
 

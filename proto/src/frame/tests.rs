@@ -39,10 +39,7 @@ fn every_field_survives() {
     assert_eq!(frame.topic(), "imu/data");
     assert_eq!(frame.origin(), header.origin);
     assert_eq!(frame.writer(), header.writer);
-    assert_eq!(
-        (frame.sequence(), frame.publish_time_ns()),
-        (42, 1_700_000_000_000_000_000)
-    );
+    assert_eq!((frame.sequence(), frame.publish_time_ns()), (42, 1_700_000_000_000_000_000));
     assert_eq!((frame.encoding(), frame.type_hash()), ("application/json", "RIHS01_00"));
     assert_eq!(frame.traceparent(), "00-1-2-03");
     assert_eq!((frame.lifespan_ms(), frame.priority()), (500, Some(Priority::State)));
@@ -58,49 +55,24 @@ fn hops_and_age_are_written_anew_and_the_rest_stays() {
     let again = Frame::parse(written.clone()).unwrap();
     assert_eq!((again.hops(), again.age_us()), (2, 1_000_000));
     let decoded = v1::MessageHeader::decode(&again.head()[PREFIX_BYTES..]).unwrap();
-    assert_eq!(
-        decoded,
-        v1::MessageHeader {
-            hops: 2,
-            age_us: 1_000_000,
-            ..header().to_wire()
-        }
-    );
+    assert_eq!(decoded, v1::MessageHeader { hops: 2, age_us: 1_000_000, ..header().to_wire() });
     let back = again.with_hops_and_age(0, 0).to_bytes();
     assert_eq!(Frame::parse(back).unwrap().hops(), 0);
 }
 
 #[test]
 fn what_is_no_frame_is_refused_with_a_reason() {
-    let good = Frame::new(&header(), Bytes::from_static(b"payload"))
-        .unwrap()
-        .to_bytes();
-    assert_eq!(
-        Frame::parse(Bytes::from_static(b"{\"a\":1}")).unwrap_err(),
-        FrameError::Magic
-    );
+    let good = Frame::new(&header(), Bytes::from_static(b"payload")).unwrap().to_bytes();
+    assert_eq!(Frame::parse(Bytes::from_static(b"{\"a\":1}")).unwrap_err(), FrameError::Magic);
     for length in 4..good.len() - 7 {
         assert!(Frame::parse(good.slice(..length)).is_err(), "{length}");
     }
     let mut huge = BytesMut::from(&b"BLZ1"[..]);
     huge.put_u32_le(5000);
+    assert_eq!(Frame::parse(huge.freeze()).unwrap_err(), FrameError::HeaderTooLarge(5000));
     assert_eq!(
-        Frame::parse(huge.freeze()).unwrap_err(),
-        FrameError::HeaderTooLarge(5000)
-    );
-    assert_eq!(
-        Frame::new(
-            &Header {
-                sequence: 0,
-                ..header()
-            },
-            Bytes::new()
-        )
-        .unwrap_err(),
-        FrameError::Field {
-            field: "sequence",
-            reason: "must be 1 or more"
-        }
+        Frame::new(&Header { sequence: 0, ..header() }, Bytes::new()).unwrap_err(),
+        FrameError::Field { field: "sequence", reason: "must be 1 or more" }
     );
     let large = Bytes::from(vec![0; MAX_PAYLOAD_BYTES + 1]);
     assert_eq!(
@@ -111,7 +83,8 @@ fn what_is_no_frame_is_refused_with_a_reason() {
 
 proptest! {
     #[test]
-    fn random_bytes_never_panic(mut bytes in proptest::collection::vec(any::<u8>(), 0..300), framed: bool) {
+    fn random_bytes_never_panic(mut bytes in proptest::collection::vec(any::<u8>(), 0..300),
+        framed: bool) {
         if framed && bytes.len() >= 8 {
             bytes[..4].copy_from_slice(&MAGIC);
             let length = u32::try_from(bytes.len() - 8).unwrap();
@@ -124,7 +97,9 @@ proptest! {
 
     #[test]
     fn a_flipped_byte_never_panics(at in 0usize..200, value: u8) {
-        let mut bytes = BytesMut::from(&Frame::new(&header(), Bytes::from_static(b"x")).unwrap().to_bytes()[..]);
+        let mut bytes =
+            BytesMut::from(&Frame::new(&header(), Bytes::from_static(b"x")).unwrap()
+            .to_bytes()[..]);
         let at = at % bytes.len();
         bytes[at] = value;
         let _ = Frame::parse(bytes.freeze());

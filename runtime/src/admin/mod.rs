@@ -1,8 +1,8 @@
 //! The admin port: `/livez`, `/readyz`, `/metrics` and what the program adds.
 //!
-//! It must answer when all else fails, so nothing that comes in from outside ends it or takes more than its share:
-//! the number of connections, the time for a request's head and the sizes of head and body are bounded, and what is
-//! no HTTP is counted and closed.
+//! It must answer when all else fails, so nothing that comes in from outside ends it or takes more
+//! than its share: the number of connections, the time for a request's head and the sizes of head
+//! and body are bounded, and what is no HTTP is counted and closed.
 
 mod readiness;
 mod routes;
@@ -70,9 +70,11 @@ pub(crate) struct Counters {
 
 impl Counters {
     fn text(&self) -> String {
-        let mut text = "# HELP blaze_admin_connections_total Connections to the admin port by what became of them.\n\
+        let mut text =
+            "# HELP blaze_admin_connections_total Connections to the admin port by what \
+                        became of them.\n\
                         # TYPE blaze_admin_connections_total counter\n"
-            .to_owned();
+                .to_owned();
         for (result, counter) in [
             ("accepted", &self.accepted),
             ("refused", &self.refused),
@@ -100,8 +102,8 @@ pub struct AdminServer {
 }
 
 impl AdminServer {
-    /// Binds the port (0: any) and says so on stderr: `admin listening on ADDRESS`. `extra` holds the program's own
-    /// routes; unknown paths and methods are answered for all.
+    /// Binds the port (0: any) and says so on stderr: `admin listening on ADDRESS`. `extra` holds
+    /// the program's own routes; unknown paths and methods are answered for all.
     ///
     /// # Errors
     /// If the address cannot be bound.
@@ -125,19 +127,16 @@ impl AdminServer {
         metrics: MetricsText,
         limits: AdminLimits,
     ) -> io::Result<Self> {
-        let describe = |error: io::Error| io::Error::new(error.kind(), format!("admin port {address}: {error}"));
+        let describe = |error: io::Error| {
+            io::Error::new(error.kind(), format!("admin port {address}: {error}"))
+        };
         let listener = TcpListener::bind(address).await.map_err(describe)?;
         let address = listener.local_addr().map_err(describe)?;
         say(format_args!("admin listening on {address}"));
         let counters = Arc::new(Counters::default());
-        let router = routes::router(extra, readiness, metrics, Arc::clone(&counters), limits.body_bytes);
-        Ok(Self {
-            listener,
-            address,
-            router,
-            limits,
-            counters,
-        })
+        let router =
+            routes::router(extra, readiness, metrics, Arc::clone(&counters), limits.body_bytes);
+        Ok(Self { listener, address, router, limits, counters })
     }
 
     /// The address with the real port.
@@ -189,7 +188,11 @@ impl AdminServer {
         }
     }
 
-    fn connection(&self, stream: TcpStream, stop: CancellationToken) -> impl Future<Output = ()> + Send + 'static {
+    fn connection(
+        &self,
+        stream: TcpStream,
+        stop: CancellationToken,
+    ) -> impl Future<Output = ()> + Send + 'static {
         let connection = http1::Builder::new()
             .timer(TokioTimer::new())
             .header_read_timeout(self.limits.head_timeout)
@@ -219,8 +222,6 @@ impl AdminServer {
 
 impl std::fmt::Debug for AdminServer {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("AdminServer")
-            .field("address", &self.address)
-            .finish_non_exhaustive()
+        f.debug_struct("AdminServer").field("address", &self.address).finish_non_exhaustive()
     }
 }

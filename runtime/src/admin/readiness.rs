@@ -102,21 +102,19 @@ impl Readiness {
     #[must_use]
     pub fn new() -> Self {
         Self {
-            shared: Arc::new(Shared {
-                checks: Mutex::default(),
-                ready: watch::Sender::new(true),
-            }),
+            shared: Arc::new(Shared { checks: Mutex::default(), ready: watch::Sender::new(true) }),
         }
     }
 
     /// Adds a check. Add all that decide before the work begins, or the process is ready too early.
-    pub fn add(&self, name: &'static str, gate: Gate, status: CheckStatus, detail: impl Into<String>) {
-        let check = Check {
-            gate,
-            status,
-            detail: bounded(detail.into()),
-            since: Instant::now(),
-        };
+    pub fn add(
+        &self,
+        name: &'static str,
+        gate: Gate,
+        status: CheckStatus,
+        detail: impl Into<String>,
+    ) {
+        let check = Check { gate, status, detail: bounded(detail.into()), since: Instant::now() };
         self.change(|checks| {
             checks.by_name.insert(name, check);
         });
@@ -186,16 +184,8 @@ impl Readiness {
             since_s: check.since.elapsed().as_secs(),
         };
         ReadinessReport {
-            status: if checks.ready() {
-                ReadinessStatus::Ready
-            } else {
-                ReadinessStatus::NotReady
-            },
-            checks: checks
-                .by_name
-                .iter()
-                .map(|(name, check)| (*name, report(check)))
-                .collect(),
+            status: if checks.ready() { ReadinessStatus::Ready } else { ReadinessStatus::NotReady },
+            checks: checks.by_name.iter().map(|(name, check)| (*name, report(check))).collect(),
         }
     }
 }

@@ -23,20 +23,16 @@ pub(super) fn router(
     let metrics = move || {
         let text = metrics() + &counters.text();
         async move {
-            (
-                [(
-                    header::CONTENT_TYPE,
-                    HeaderValue::from_static("text/plain; version=0.0.4"),
-                )],
-                text,
-            )
+            ([(header::CONTENT_TYPE, HeaderValue::from_static("text/plain; version=0.0.4"))], text)
         }
     };
     extra
         .route("/livez", get(|| async { Json(json!({ "status": "alive" })) }))
         .route("/readyz", get(move || std::future::ready(readyz(&readiness))))
         .route("/metrics", get(metrics))
-        .fallback(|uri: Uri| async move { error(StatusCode::NOT_FOUND, "not_found", &format!("no {}", uri.path())) })
+        .fallback(|uri: Uri| async move {
+            error(StatusCode::NOT_FOUND, "not_found", &format!("no {}", uri.path()))
+        })
         .method_not_allowed_fallback(|method: Method, uri: Uri| async move {
             let detail = format!("{method} is not for {}", uri.path());
             error(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", &detail)

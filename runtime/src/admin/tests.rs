@@ -30,27 +30,18 @@ async fn serve(limits: AdminLimits) -> Served {
         );
     let any = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let metrics: MetricsText = Arc::new(|| "blaze_test 1\n".to_owned());
-    let server = AdminServer::bind_with(any, extra, readiness.clone(), metrics, limits)
-        .await
-        .unwrap();
+    let server =
+        AdminServer::bind_with(any, extra, readiness.clone(), metrics, limits).await.unwrap();
     let address = server.address();
     server.serve(&supervisor);
-    Served {
-        supervisor,
-        readiness,
-        address,
-    }
+    Served { supervisor, readiness, address }
 }
 
 /// What comes back until the other side closes; a reset is an end too.
 async fn read_all(stream: &mut TcpStream) -> String {
     let mut answer = Vec::new();
     let read = tokio::time::timeout(SOON, stream.read_to_end(&mut answer)).await;
-    assert!(
-        read.is_ok(),
-        "the port does not close: {}",
-        String::from_utf8_lossy(&answer)
-    );
+    assert!(read.is_ok(), "the port does not close: {}", String::from_utf8_lossy(&answer));
     String::from_utf8_lossy(&answer).into_owned()
 }
 
@@ -71,15 +62,9 @@ impl Served {
         let _ = stream.write_all(request.as_bytes()).await;
         let answer = read_all(&mut stream).await;
         let (head, body) = answer.split_once("\r\n\r\n").unwrap_or((&answer, ""));
-        let status = head
-            .split(' ')
-            .nth(1)
-            .and_then(|status| status.parse().ok())
-            .unwrap_or(0);
-        let content_type = head
-            .lines()
-            .find_map(|line| line.strip_prefix("content-type: "))
-            .unwrap_or_default();
+        let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap_or(0);
+        let content_type =
+            head.lines().find_map(|line| line.strip_prefix("content-type: ")).unwrap_or_default();
         (status, content_type.to_owned(), body.to_owned())
     }
 
@@ -93,12 +78,7 @@ impl Served {
     async fn count(&self, result: &str) -> u64 {
         let (_, _, metrics) = self.request("GET", "/metrics", "").await;
         let name = format!("blaze_admin_connections_total{{result=\"{result}\"}} ");
-        metrics
-            .lines()
-            .find_map(|line| line.strip_prefix(&name))
-            .unwrap()
-            .parse()
-            .unwrap()
+        metrics.lines().find_map(|line| line.strip_prefix(&name)).unwrap().parse().unwrap()
     }
 
     async fn count_reaches(&self, result: &str, least: u64) {
@@ -117,9 +97,7 @@ impl Served {
 #[tokio::test]
 async fn readiness_reads_as_documented() {
     let served = serve(AdminLimits::default()).await;
-    served
-        .readiness
-        .add("node_broker", Gate::Decides, CheckStatus::Failed, "connecting");
+    served.readiness.add("node_broker", Gate::Decides, CheckStatus::Failed, "connecting");
     served.readiness.add("config", Gate::Shows, CheckStatus::Ok, "");
     let (status, report) = served.json("GET", "/readyz").await;
     assert_eq!(status, 503);
@@ -165,10 +143,7 @@ async fn the_rest_is_answered_as_json() {
     let (status, error) = served.json("GET", "/nothing").await;
     assert_eq!(
         (status, error),
-        (
-            404,
-            json!({ "error": { "code": "not_found", "detail": "no /nothing" } })
-        )
+        (404, json!({ "error": { "code": "not_found", "detail": "no /nothing" } }))
     );
     for path in ["/readyz", "/v1/topics"] {
         let (status, error) = served.json("POST", path).await;
@@ -180,10 +155,7 @@ async fn the_rest_is_answered_as_json() {
     }
     let (status, content_type, body) = served.request("GET", "/metrics", "").await;
     assert_eq!((status, content_type.as_str()), (200, "text/plain; version=0.0.4"));
-    assert!(
-        body.starts_with("blaze_test 1\n# HELP blaze_admin_connections_total "),
-        "{body}"
-    );
+    assert!(body.starts_with("blaze_test 1\n# HELP blaze_admin_connections_total "), "{body}");
 }
 
 #[tokio::test]
@@ -219,10 +191,7 @@ async fn a_panic_in_a_handler_costs_one_connection() {
 
 #[tokio::test]
 async fn slow_heads_and_idle_connections_are_closed() {
-    let limits = AdminLimits {
-        head_timeout: Duration::from_millis(100),
-        ..AdminLimits::default()
-    };
+    let limits = AdminLimits { head_timeout: Duration::from_millis(100), ..AdminLimits::default() };
     let served = serve(limits).await;
     for start in ["", "GET /livez HT", "GET /livez HTTP/1.1\r\nhost: x\r\n\r\n"] {
         let mut stream = TcpStream::connect(served.address).await.unwrap();
@@ -240,10 +209,7 @@ async fn large_bodies_are_refused() {
 
 #[tokio::test]
 async fn connections_are_bounded() {
-    let limits = AdminLimits {
-        connections: 4,
-        ..AdminLimits::default()
-    };
+    let limits = AdminLimits { connections: 4, ..AdminLimits::default() };
     let served = serve(limits).await;
     let mut held = Vec::new();
     for _ in 0..4 {
@@ -275,10 +241,5 @@ async fn a_taken_port_is_named() {
     let error = AdminServer::bind(served.address, Router::new(), Readiness::new(), metrics)
         .await
         .unwrap_err();
-    assert!(
-        error
-            .to_string()
-            .starts_with(&format!("admin port {}: ", served.address)),
-        "{error}"
-    );
+    assert!(error.to_string().starts_with(&format!("admin port {}: ", served.address)), "{error}");
 }

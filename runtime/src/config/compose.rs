@@ -1,7 +1,7 @@
 //! What holds of a file and an overlay that change apart from each other.
 //!
-//! Each has a newest state and one that holds. A faulty state of one changes nothing and keeps the other from nothing: the
-//! other's newest is then taken together with what held before.
+//! Each has a newest state and one that holds. A faulty state of one changes nothing and keeps the
+//! other from nothing: the other's newest is then taken together with what held before.
 
 use std::sync::Arc;
 
@@ -71,9 +71,7 @@ impl<T> Composition<T> {
     pub(super) fn judge(&mut self) -> Judgement<T> {
         let file = self.file();
         let overlay = self.overlay.clone();
-        let whole = file
-            .clone()
-            .and_then(|text| Ok((self.read(&text, overlay.as_ref())?, text)));
+        let whole = file.clone().and_then(|text| Ok((self.read(&text, overlay.as_ref())?, text)));
         let faults = match whole {
             Ok((loaded, text)) => return self.hold(loaded, text, overlay),
             Err(faults) => faults,
@@ -89,11 +87,7 @@ impl<T> Composition<T> {
             // That there is none any more cannot be faulty: then the file alone is.
             of_file = of_file.or(of_overlay.take());
         }
-        Judgement {
-            loaded,
-            faults: of_file.map(Arc::from),
-            overlay: verdict(overlay, of_overlay),
-        }
+        Judgement { loaded, faults: of_file.map(Arc::from), overlay: verdict(overlay, of_overlay) }
     }
 
     /// Both are new, and together faulty.
@@ -120,21 +114,25 @@ impl<T> Composition<T> {
         }
     }
 
-    fn hold(&mut self, loaded: Loaded<T>, text: Option<NamedText>, overlay: Option<Overlay>) -> Judgement<T> {
+    fn hold(
+        &mut self,
+        loaded: Loaded<T>,
+        text: Option<NamedText>,
+        overlay: Option<Overlay>,
+    ) -> Judgement<T> {
         self.good_file = text;
         self.good_overlay.clone_from(&overlay);
-        Judgement {
-            loaded: Some(loaded),
-            faults: None,
-            overlay: verdict(overlay, None),
-        }
+        Judgement { loaded: Some(loaded), faults: None, overlay: verdict(overlay, None) }
     }
 
     fn file(&self) -> Result<Option<NamedText>, Faults> {
         let text = self.seen.clone().map_err(|fault| vec![fault])?;
-        // A file that is being written is empty for a moment. It would be valid and reset everything to its default.
+        // A file that is being written is empty for a moment. It would be valid and reset
+        // everything to its default.
         let is_empty = |text: &NamedText| text.1.trim().is_empty();
-        if text.as_ref().is_some_and(is_empty) && self.good_file.as_ref().is_some_and(|text| !is_empty(text)) {
+        if text.as_ref().is_some_and(is_empty)
+            && self.good_file.as_ref().is_some_and(|text| !is_empty(text))
+        {
             let (document, _) = Document::from_text(&self.sources, self.good_file.clone(), None);
             let before = document.map(|document| document.fault("", "has become empty"));
             return Err(before.into_iter().collect());
@@ -142,14 +140,15 @@ impl<T> Composition<T> {
         Ok(text)
     }
 
-    fn read(&self, text: &Option<NamedText>, overlay: Option<&Overlay>) -> Result<Loaded<T>, Faults> {
+    fn read(
+        &self,
+        text: &Option<NamedText>,
+        overlay: Option<&Overlay>,
+    ) -> Result<Loaded<T>, Faults> {
         judge(Document::from_text(&self.sources, text.clone(), overlay), &self.schema)
     }
 }
 
 fn verdict(overlay: Option<Overlay>, faults: Option<Faults>) -> Option<Verdict> {
-    Some(Verdict {
-        overlay: overlay?,
-        faults: faults.map(Arc::from),
-    })
+    Some(Verdict { overlay: overlay?, faults: faults.map(Arc::from) })
 }

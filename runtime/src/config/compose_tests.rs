@@ -246,10 +246,7 @@ fn stage(file: &str) -> Stage {
     let follower = Follower {
         told,
         readiness: readiness.clone(),
-        keys: Keys {
-            read: &["limit", "mode"],
-            live: &["limit"],
-        },
+        keys: Keys { read: &["limit", "mode"], live: &["limit"] },
         needs_restart: |started, now| started.1 != now.1,
     };
     let (taken, judged) = (Arc::clone(&given), Arc::clone(&given));
@@ -269,13 +266,7 @@ fn stage(file: &str) -> Stage {
             },
         ),
     );
-    Stage {
-        folder,
-        over,
-        readiness,
-        given,
-        _supervisor: supervisor,
-    }
+    Stage { folder, over, readiness, given, _supervisor: supervisor }
 }
 
 fn follower_told(
@@ -304,10 +295,7 @@ impl Stage {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
         };
-        assert!(
-            tokio::time::timeout(Duration::from_secs(10), wait).await.is_ok(),
-            "{what}"
-        );
+        assert!(tokio::time::timeout(Duration::from_secs(10), wait).await.is_ok(), "{what}");
     }
 }
 

@@ -18,12 +18,14 @@ const PREFIX: &str = "BLAZE__";
 /// Name and content of a file, or of what counts as one.
 pub type NamedText = (Arc<str>, Arc<str>);
 
-/// Where a configuration comes from. Precedence: overrides > environment > [overlay](Overlay) > file > defaults of the schema.
+/// Where a configuration comes from. Precedence: overrides > environment > [overlay](Overlay) >
+/// file > defaults of the schema.
 #[derive(Debug, Clone, Default)]
 pub struct Sources {
     /// The file that was asked for (`--config`, else `BLAZE_CONFIG`). It must exist.
     pub file: Option<PathBuf>,
-    /// A text that is read in place of any file, as programs have that make their configuration themselves.
+    /// A text that is read in place of any file, as programs have that make their configuration
+    /// themselves.
     pub text: Option<NamedText>,
     /// Files to look for if none was asked for; the first that exists is taken.
     pub search: Vec<PathBuf>,
@@ -36,11 +38,13 @@ pub struct Sources {
 }
 
 impl Sources {
-    /// The sources of a process: `--config`, else `BLAZE_CONFIG`, else `./blaze.yaml`, else `/etc/blaze/blaze.yaml`.
+    /// The sources of a process: `--config`, else `BLAZE_CONFIG`, else `./blaze.yaml`, else
+    /// `/etc/blaze/blaze.yaml`.
     #[must_use]
     pub fn of_process(config_option: Option<PathBuf>, overrides: Vec<(String, String)>) -> Self {
         Self {
-            file: config_option.or_else(|| environment::variable("BLAZE_CONFIG").map(PathBuf::from)),
+            file: config_option
+                .or_else(|| environment::variable("BLAZE_CONFIG").map(PathBuf::from)),
             search: vec![PathBuf::from("./blaze.yaml"), PathBuf::from("/etc/blaze/blaze.yaml")],
             environment: environment::variables(PREFIX),
             overrides,
@@ -51,19 +55,13 @@ impl Sources {
     /// One file, nothing else.
     #[must_use]
     pub fn of_file(file: impl Into<PathBuf>) -> Self {
-        Self {
-            file: Some(file.into()),
-            ..Self::default()
-        }
+        Self { file: Some(file.into()), ..Self::default() }
     }
 
     /// One text, nothing else. Faults are told with `name` as that of a file.
     #[must_use]
     pub fn of_text(name: &str, text: &str) -> Self {
-        Self {
-            text: Some((Arc::from(name), Arc::from(text))),
-            ..Self::default()
-        }
+        Self { text: Some((Arc::from(name), Arc::from(text))), ..Self::default() }
     }
 
     /// The file that is read now, if there is one.
@@ -72,18 +70,14 @@ impl Sources {
         if self.text.is_some() {
             return None;
         }
-        self.file
-            .clone()
-            .or_else(|| self.search.iter().find(|file| file.exists()).cloned())
+        self.file.clone().or_else(|| self.search.iter().find(|file| file.exists()).cloned())
     }
 
-    /// The same sources, bound to the file that is read now: another file that appears later is not taken instead.
+    /// The same sources, bound to the file that is read now: another file that appears later is not
+    /// taken instead.
     #[must_use]
     pub fn pinned(&self) -> Self {
-        Self {
-            file: self.resolve_file(),
-            ..self.clone()
-        }
+        Self { file: self.resolve_file(), ..self.clone() }
     }
 
     /// The text of the file; `Ok(None)` if there is none and none is needed.
@@ -95,11 +89,8 @@ impl Sources {
             if self.file_may_be_absent {
                 return Ok(None);
             }
-            let looked = self
-                .search
-                .iter()
-                .map(|file| file.display().to_string())
-                .collect::<Vec<_>>();
+            let looked =
+                self.search.iter().map(|file| file.display().to_string()).collect::<Vec<_>>();
             return Err(LocatedFault {
                 place: Place::Nowhere,
                 path: String::new(),
@@ -127,7 +118,9 @@ impl Sources {
 /// In words, if there is no `=` or no key before it.
 pub fn parse_override(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
-        Some((path, value)) if well_formed(path.trim()) => Ok((path.trim().to_owned(), value.to_owned())),
+        Some((path, value)) if well_formed(path.trim()) => {
+            Ok((path.trim().to_owned(), value.to_owned()))
+        }
         _ => Err("give it as section.key=value, such as flow.bandwidth.limit_mbps=40".to_owned()),
     }
 }
@@ -138,9 +131,7 @@ fn read_bounded(file: &Path) -> Result<String, String> {
     let mut bytes = Vec::new();
     // One byte more than allowed tells a file that is too large.
     let mut limited = open.take(MAX_FILE_BYTES + 1);
-    limited
-        .read_to_end(&mut bytes)
-        .map_err(|error| format!("cannot be read: {error}"))?;
+    limited.read_to_end(&mut bytes).map_err(|error| format!("cannot be read: {error}"))?;
     if bytes.len() as u64 > MAX_FILE_BYTES {
         return Err(format!("is larger than {MAX_FILE_BYTES} bytes"));
     }
@@ -173,8 +164,8 @@ impl Document {
         }
     }
 
-    /// Reads all sources; the document is there as far as it could be read, so that a schema can look for its own
-    /// faults in the same run.
+    /// Reads all sources; the document is there as far as it could be read, so that a schema can
+    /// look for its own faults in the same run.
     #[must_use]
     pub fn load_with_faults(sources: &Sources) -> (Option<Self>, Vec<LocatedFault>) {
         match sources.read_file() {
@@ -242,22 +233,14 @@ impl Document {
     #[must_use]
     pub fn fault(&self, path: impl Into<String>, detail: impl Into<String>) -> LocatedFault {
         let path = path.into();
-        LocatedFault {
-            place: self.locate(&path),
-            path,
-            detail: detail.into(),
-        }
+        LocatedFault { place: self.locate(&path), path, detail: detail.into() }
     }
 
     /// Puts the YAML text of an override at its path, in place of what stands there.
     fn put(&mut self, path: &str, place: &Place, text: &str) -> Result<(), Vec<LocatedFault>> {
         let steps = steps(path);
         let faulty = |path: &str, detail: String| {
-            vec![LocatedFault {
-                place: place.clone(),
-                path: path.to_owned(),
-                detail,
-            }]
+            vec![LocatedFault { place: place.clone(), path: path.to_owned(), detail }]
         };
         if steps.len() >= MAX_DEPTH {
             return Err(faulty("", format!("is nested deeper than {MAX_DEPTH}")));
@@ -290,9 +273,12 @@ impl Document {
     }
 }
 
-/// All overrides in the order in which they are applied: the environment from the general to the particular, then the
-/// command line as it stands.
-fn overrides<'s>(sources: &'s Sources, faults: &mut Vec<LocatedFault>) -> Vec<(String, Place, &'s str)> {
+/// All overrides in the order in which they are applied: the environment from the general to the
+/// particular, then the command line as it stands.
+fn overrides<'s>(
+    sources: &'s Sources,
+    faults: &mut Vec<LocatedFault>,
+) -> Vec<(String, Place, &'s str)> {
     let mut refuse = |place: &Place, detail: &str| {
         faults.push(LocatedFault {
             place: place.clone(),
@@ -303,11 +289,8 @@ fn overrides<'s>(sources: &'s Sources, faults: &mut Vec<LocatedFault>) -> Vec<(S
     let mut out = Vec::new();
     for (name, value) in &sources.environment {
         let place = Place::Environment(Arc::from(name.as_str()));
-        let path = name
-            .strip_prefix(PREFIX)
-            .unwrap_or(name)
-            .to_ascii_lowercase()
-            .replace("__", ".");
+        let path =
+            name.strip_prefix(PREFIX).unwrap_or(name).to_ascii_lowercase().replace("__", ".");
         if well_formed(&path) {
             out.push((path, place, value.as_str()));
         } else {
@@ -344,10 +327,13 @@ fn steps(path: &str) -> Vec<Step<'_>> {
     for part in path.split('.') {
         let (key, mut rest) = part.split_at(part.find('[').unwrap_or(part.len()));
         out.push(Step::Key(key));
-        while let Some((index, behind)) = rest.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        while let Some((index, behind)) =
+            rest.strip_prefix('[').and_then(|rest| rest.split_once(']'))
+        {
             match index.parse() {
                 Ok(index) => out.push(Step::Index(index)),
-                // No index: then it is part of a key, which no schema knows and which is refused by name.
+                // No index: then it is part of a key, which no schema knows and which is refused by
+                // name.
                 Err(_) => out.push(Step::Key(index)),
             }
             rest = behind;
@@ -356,8 +342,13 @@ fn steps(path: &str) -> Vec<Step<'_>> {
     out
 }
 
-/// The slot one step further, made where nothing stands. The error is a path and what is wrong there.
-fn descend<'v>(slot: &'v mut Value, step: &Step<'_>, at: String) -> Result<(&'v mut Value, String), (String, String)> {
+/// The slot one step further, made where nothing stands. The error is a path and what is wrong
+/// there.
+fn descend<'v>(
+    slot: &'v mut Value,
+    step: &Step<'_>,
+    at: String,
+) -> Result<(&'v mut Value, String), (String, String)> {
     let index = match (step, &*slot) {
         (Step::Index(index), _) => Some(*index),
         (Step::Key(key), Value::Array(_)) => key.parse().ok(),

@@ -1,4 +1,5 @@
-//! What a program does with its configuration while it runs: takes over what is good, and says what is not.
+//! What a program does with its configuration while it runs: takes over what is good, and says what
+//! is not.
 //!
 //! ```text
 //! Current ─▶ good and new ─▶ the program ─▶ is anything left for a restart? ─┬─▶ `/readyz`, check `config`
@@ -39,8 +40,9 @@ pub struct Follower<T> {
     pub needs_restart: fn(&T, &T) -> bool,
 }
 
-/// Hands each good configuration to `take`, shows the others, and tells `judged` what became of the overlay whenever that is
-/// something else than before, with what is to be said of it besides. Ends with the watch.
+/// Hands each good configuration to `take`, shows the others, and tells `judged` what became of the
+/// overlay whenever that is something else than before, with what is to be said of it besides. Ends
+/// with the watch.
 pub async fn follow<T: Send + Sync>(
     mut follower: Follower<T>,
     mut take: impl FnMut(&Loaded<T>),
@@ -127,8 +129,7 @@ fn named(paths: &[String]) -> String {
 }
 
 fn is_at_or_below(path: &str, key: &str) -> bool {
-    path.strip_prefix(key)
-        .is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
+    path.strip_prefix(key).is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
 }
 
 /// Paths of the values that differ; a list is one value, and what is missing is `null`.
@@ -136,7 +137,9 @@ fn different(one: &Value, other: &Value, at: &str, out: &mut Vec<String>) {
     let members = |value: &Value, name: &str| value.get(name).cloned().unwrap_or(Value::Null);
     match (one, other) {
         (Value::Object(_) | Value::Null, Value::Object(_) | Value::Null) => {
-            let names = |value: &Value| value.as_object().map(|map| map.keys().cloned().collect::<Vec<_>>());
+            let names = |value: &Value| {
+                value.as_object().map(|map| map.keys().cloned().collect::<Vec<_>>())
+            };
             let mut both = names(one).unwrap_or_default();
             both.extend(names(other).unwrap_or_default());
             both.sort();
@@ -163,7 +166,9 @@ mod tests {
         let mut paths = Vec::new();
         different(&one, &other, "", &mut paths);
         assert_eq!(paths, ["a.b", "a.c", "e.f"]);
-        assert!(is_at_or_below("a.b", "a") && is_at_or_below("a[0]", "a") && is_at_or_below("a", "a"));
+        assert!(
+            is_at_or_below("a.b", "a") && is_at_or_below("a[0]", "a") && is_at_or_below("a", "a")
+        );
         assert!(!is_at_or_below("ab", "a"));
         let many: Vec<String> = (0..7).map(|number| number.to_string()).collect();
         assert_eq!(named(&many), "0, 1, 2, 3, 4 and 2 more");

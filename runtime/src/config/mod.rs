@@ -1,4 +1,5 @@
-//! The configuration of a process: from files, environment and options to a typed value, and again when it changes.
+//! The configuration of a process: from files, environment and options to a typed value, and again
+//! when it changes.
 //!
 //! ```text
 //! file ─────┐
@@ -69,7 +70,10 @@ pub struct Loaded<T> {
 ///
 /// # Errors
 /// Every fault of form and of the schema, in the order of the lines.
-pub fn load_typed<T>(sources: &Sources, schema: &Schema<T>) -> Result<Loaded<T>, Vec<LocatedFault>> {
+pub fn load_typed<T>(
+    sources: &Sources,
+    schema: &Schema<T>,
+) -> Result<Loaded<T>, Vec<LocatedFault>> {
     judge(Document::load_with_faults(sources), schema)
 }
 
@@ -82,11 +86,7 @@ fn judge<T>(
         Some((Ok((value, remarks)), document)) if faults.is_empty() => {
             let mut warnings = located(&document, remarks);
             warnings.sort();
-            return Ok(Loaded {
-                value,
-                document,
-                warnings,
-            });
+            return Ok(Loaded { value, document, warnings });
         }
         Some((Err(remarks), document)) => faults.extend(located(&document, remarks)),
         Some((Ok(_), _)) | None => {}
@@ -97,8 +97,5 @@ fn judge<T>(
 }
 
 fn located(document: &Document, remarks: Vec<Remark>) -> Vec<LocatedFault> {
-    remarks
-        .into_iter()
-        .map(|(path, detail)| document.fault(path, detail))
-        .collect()
+    remarks.into_iter().map(|(path, detail)| document.fault(path, detail)).collect()
 }

@@ -16,7 +16,8 @@ pub struct Overlay {
     pub revision: u64,
     /// Another one for another tree.
     pub hash: Arc<str>,
-    /// Merged over the tree of the file (RFC 7396): objects member by member, all else is replaced, `null` removes.
+    /// Merged over the tree of the file (RFC 7396): objects member by member, all else is replaced,
+    /// `null` removes.
     pub tree: Arc<Value>,
 }
 
@@ -42,10 +43,7 @@ pub struct Verdict {
 
 impl Overlay {
     pub(super) fn place(&self) -> Place {
-        Place::Overlay {
-            origin: Arc::clone(&self.origin),
-            revision: self.revision,
-        }
+        Place::Overlay { origin: Arc::clone(&self.origin), revision: self.revision }
     }
 }
 
@@ -74,13 +72,7 @@ fn merge_at(slot: &mut Value, places: &mut Places, patch: &Value, place: &Place,
             places.forget_below(&below);
             places.set(&below, place.clone());
         } else {
-            merge_at(
-                out.entry(name.clone()).or_insert(Value::Null),
-                places,
-                member,
-                place,
-                &below,
-            );
+            merge_at(out.entry(name.clone()).or_insert(Value::Null), places, member, place, &below);
         }
     }
 }
@@ -93,18 +85,18 @@ mod tests {
 
     #[test]
     fn an_overlay_is_a_merge_patch_and_what_it_says_has_its_place() {
-        let file = |line| Place::File {
-            file: Arc::from("a.yaml"),
-            line,
-        };
-        let mut value = json!({ "flow": { "bandwidth": { "limit_mbps": 1, "overhead": 2 }, "topics": [ { "match": "a" } ] }, "gone": { "a": 1 } });
+        let file = |line| Place::File { file: Arc::from("a.yaml"), line };
+        let mut value = json!({
+            "flow": {
+                "bandwidth": { "limit_mbps": 1, "overhead": 2 },
+                "topics": [ { "match": "a" } ],
+            },
+            "gone": { "a": 1 },
+        });
         let mut places = Places::default();
-        for (path, line) in [
-            ("", 1),
-            ("flow.bandwidth.overhead", 2),
-            ("flow.topics[0].match", 3),
-            ("gone.a", 4),
-        ] {
+        for (path, line) in
+            [("", 1), ("flow.bandwidth.overhead", 2), ("flow.topics[0].match", 3), ("gone.a", 4)]
+        {
             places.set(path, file(line));
         }
         let overlay = Overlay {
@@ -112,7 +104,10 @@ mod tests {
             revision: 431,
             hash: Arc::from("sha256:a"),
             tree: Arc::new(json!({
-                "flow": { "bandwidth": { "limit_mbps": 40 }, "topics": [ { "match": "b" }, { "match": "c" } ] },
+                "flow": {
+                    "bandwidth": { "limit_mbps": 40 },
+                    "topics": [ { "match": "b" }, { "match": "c" } ],
+                },
                 "gone": null, "log": { "level": "debug" },
             })),
         };
@@ -120,7 +115,10 @@ mod tests {
         assert_eq!(
             value,
             json!({
-                "flow": { "bandwidth": { "limit_mbps": 40, "overhead": 2 }, "topics": [ { "match": "b" }, { "match": "c" } ] },
+                "flow": {
+                    "bandwidth": { "limit_mbps": 40, "overhead": 2 },
+                    "topics": [ { "match": "b" }, { "match": "c" } ],
+                },
                 "log": { "level": "debug" },
             })
         );

@@ -60,7 +60,8 @@ pub struct LocatedFault {
 }
 
 impl LocatedFault {
-    /// Whether it is that a text has more documents than [`yaml_documents`](super::yaml_documents) was to read.
+    /// Whether it is that a text has more documents than [`yaml_documents`](super::yaml_documents)
+    /// was to read.
     #[must_use]
     pub fn is_too_many_documents(&self) -> bool {
         self.path.is_empty() && self.detail.starts_with(TOO_MANY_DOCUMENTS)
@@ -96,7 +97,8 @@ impl Places {
 
     /// Forgets what stands below a path, for its value is replaced.
     pub(super) fn forget_below(&mut self, path: &str) {
-        let below = |key: &str| key.strip_prefix(path).is_some_and(|rest| rest.starts_with(['.', '[']));
+        let below =
+            |key: &str| key.strip_prefix(path).is_some_and(|rest| rest.starts_with(['.', '[']));
         self.by_path.retain(|key, _| !below(key));
     }
 
@@ -117,11 +119,7 @@ impl Places {
 
 /// The path of a key below a path.
 pub(super) fn join(path: &str, key: &str) -> String {
-    if path.is_empty() {
-        key.to_owned()
-    } else {
-        format!("{path}.{key}")
-    }
+    if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") }
 }
 
 #[cfg(test)]
@@ -130,10 +128,7 @@ mod tests {
 
     #[test]
     fn missing_paths_have_the_place_of_their_ancestor() {
-        let line = |line| Place::File {
-            file: Arc::from("a.yaml"),
-            line,
-        };
+        let line = |line| Place::File { file: Arc::from("a.yaml"), line };
         let mut places = Places::default();
         assert_eq!(places.locate("flow"), Place::Nowhere);
         places.set("", line(1));
@@ -152,10 +147,7 @@ mod tests {
     #[test]
     fn a_fault_reads_as_documented() {
         let fault = LocatedFault {
-            place: Place::File {
-                file: Arc::from("blaze.yaml"),
-                line: 12,
-            },
+            place: Place::File { file: Arc::from("blaze.yaml"), line: 12 },
             path: "flow.bandwidth.limit_mbps".to_owned(),
             detail: "expected a number".to_owned(),
         };

@@ -45,7 +45,9 @@ fn radix_number(text: &str) -> Option<Result<Value, String>> {
 fn is_decimal(text: &str) -> bool {
     let digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit());
     let (mantissa, exponent) = match text.split_once(['e', 'E']) {
-        Some((mantissa, exponent)) => (mantissa, Some(exponent.strip_prefix(['-', '+']).unwrap_or(exponent))),
+        Some((mantissa, exponent)) => {
+            (mantissa, Some(exponent.strip_prefix(['-', '+']).unwrap_or(exponent)))
+        }
         None => (text, None),
     };
     let (before, after) = mantissa.split_once('.').unwrap_or((mantissa, ""));
@@ -65,14 +67,8 @@ fn decimal(text: &str) -> Result<Value, String> {
     }
     // An integer that fits neither must not become a float, which would be another number.
     let is_integer = plain.trim_start_matches('-').bytes().all(|byte| byte.is_ascii_digit());
-    let number = plain
-        .parse::<f64>()
-        .ok()
-        .filter(|_| !is_integer)
-        .and_then(Number::from_f64);
-    number
-        .map(Value::Number)
-        .ok_or_else(|| "is a number too large to hold".to_owned())
+    let number = plain.parse::<f64>().ok().filter(|_| !is_integer).and_then(Number::from_f64);
+    number.map(Value::Number).ok_or_else(|| "is a number too large to hold".to_owned())
 }
 
 #[cfg(test)]

@@ -42,10 +42,7 @@ fn file(directory: &TempDir, text: &str) -> PathBuf {
 }
 
 fn pairs(pairs: &[(&str, &str)]) -> Vec<(String, String)> {
-    pairs
-        .iter()
-        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-        .collect()
+    pairs.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
 }
 
 fn texts(faults: &[LocatedFault]) -> Vec<String> {
@@ -99,10 +96,7 @@ mod loading {
             ("flow.bandwidth.overhead", "--set flow.bandwidth.overhead".to_owned()),
             ("flow.bandwidth.share", "environment BLAZE__FLOW__BANDWIDTH".to_owned()),
             ("flow.topics[0]", format!("{name}:4")),
-            (
-                "flow.topics[0].priority",
-                "environment BLAZE__FLOW__TOPICS__0__PRIORITY".to_owned(),
-            ),
+            ("flow.topics[0].priority", "environment BLAZE__FLOW__TOPICS__0__PRIORITY".to_owned()),
             ("flow.topics[0].match", "--set flow.topics[0].match".to_owned()),
             ("flow.topics[1]", "--set flow.topics[1].match".to_owned()),
             ("node", "--set node.name".to_owned()),
@@ -117,7 +111,11 @@ mod loading {
         let directory = tempfile::tempdir().unwrap();
         let path = file(&directory, "# comment\nlimit: fast\nname: &n x\n\nspeed: 3\nname: y\n");
         let sources = Sources {
-            environment: pairs(&[("BLAZE__SPEED", "4"), ("BLAZE____X", "1"), ("BLAZE__NAME__X", "1")]),
+            environment: pairs(&[
+                ("BLAZE__SPEED", "4"),
+                ("BLAZE____X", "1"),
+                ("BLAZE__NAME__X", "1"),
+            ]),
             overrides: pairs(&[("colour", "[1"), ("limit[0]", "5"), ("a..b", "6"), ("extra", "1")]),
             ..Sources::of_file(&path)
         };
@@ -127,7 +125,8 @@ mod loading {
             format!("{name}:2: limit: expected a number"),
             format!("{name}:3: name: anchors (&name) are not allowed: write the value out"),
             format!("{name}:6: name: is given twice"),
-            "environment BLAZE__NAME__X: name: holds a value, so nothing can be set below it".to_owned(),
+            "environment BLAZE__NAME__X: name: holds a value, so nothing can be set below it"
+                .to_owned(),
             "environment BLAZE__SPEED: speed: unknown key".to_owned(),
             "environment BLAZE____X: is not of the form BLAZE__SECTION__KEY".to_owned(),
             "--set a..b: is not of the form section.key=value".to_owned(),
@@ -151,10 +150,7 @@ mod loading {
         let path = file(&directory, "limit: 5\nold: 1\n");
         let loaded = load_typed(&Sources::of_file(&path), &schema()).unwrap();
         assert_eq!(loaded.value.0, 5.0);
-        assert_eq!(
-            texts(&loaded.warnings),
-            [format!("{}:2: old: not in effect", path.display())]
-        );
+        assert_eq!(texts(&loaded.warnings), [format!("{}:2: old: not in effect", path.display())]);
     }
 
     #[test]
@@ -163,10 +159,7 @@ mod loading {
         let second = file(&directory, "limit: 2\n");
         let first = directory.path().join("first.yaml");
         let search = vec![first.clone(), second.clone()];
-        let sources = Sources {
-            search,
-            ..Sources::default()
-        };
+        let sources = Sources { search, ..Sources::default() };
         assert_eq!(Document::load(&sources).unwrap().file(), Some(second.as_path()));
         let pinned = sources.pinned();
         fs::write(&first, "limit: 1\n").unwrap();
@@ -176,20 +169,14 @@ mod loading {
 
     #[test]
     fn a_missing_file_says_what_was_looked_for() {
-        let nowhere = vec![
-            PathBuf::from("/nonexistent/a.yaml"),
-            PathBuf::from("/nonexistent/b.yaml"),
-        ];
-        let mut sources = Sources {
-            search: nowhere,
-            ..Sources::default()
-        };
+        let nowhere =
+            vec![PathBuf::from("/nonexistent/a.yaml"), PathBuf::from("/nonexistent/b.yaml")];
+        let mut sources = Sources { search: nowhere, ..Sources::default() };
         assert_eq!(
             texts(&Document::load(&sources).unwrap_err()),
-            [
-                "configuration: no file: give --config FILE or BLAZE_CONFIG, or make one of /nonexistent/a.yaml, \
-              /nonexistent/b.yaml"
-            ]
+            ["configuration: no file: give --config FILE or BLAZE_CONFIG, or make one of \
+              /nonexistent/a.yaml, \
+              /nonexistent/b.yaml"]
         );
         sources.file_may_be_absent = true;
         sources.overrides = pairs(&[("limit", "7")]);
@@ -197,19 +184,22 @@ mod loading {
         // A file that was asked for must exist all the same.
         sources.file = Some(PathBuf::from("/nonexistent/c.yaml"));
         let faults = texts(&Document::load(&sources).unwrap_err());
-        assert!(
-            faults[0].starts_with("/nonexistent/c.yaml: cannot be opened: "),
-            "{faults:?}"
-        );
+        assert!(faults[0].starts_with("/nonexistent/c.yaml: cannot be opened: "), "{faults:?}");
     }
 
     #[test]
     fn files_are_bounded_and_text() {
         let directory = tempfile::tempdir().unwrap();
         let large = file(&directory, &"#".repeat(usize::try_from(MAX_FILE_BYTES).unwrap() + 1));
-        assert!(texts(&Document::load(&Sources::of_file(&large)).unwrap_err())[0].contains("is larger than 1048576"));
+        assert!(
+            texts(&Document::load(&Sources::of_file(&large)).unwrap_err())[0]
+                .contains("is larger than 1048576")
+        );
         fs::write(&large, b"a: 1\nb: \xff\n").unwrap();
-        assert!(texts(&Document::load(&Sources::of_file(&large)).unwrap_err())[0].ends_with("line 2 is not UTF-8"));
+        assert!(
+            texts(&Document::load(&Sources::of_file(&large)).unwrap_err())[0]
+                .ends_with("line 2 is not UTF-8")
+        );
         fs::write(&large, "\u{feff}limit: 3\n").unwrap();
         assert_eq!(
             *Document::load(&Sources::of_file(&large)).unwrap().value(),
@@ -227,7 +217,8 @@ mod loading {
 
     proptest::proptest! {
         #[test]
-        fn no_override_panics(path in "[a-c.\\[\\]0-2]{0,12}", value in "[a-c0-9:,\\[\\]{} &*]{0,12}") {
+        fn no_override_panics(path in "[a-c.\\[\\]0-2]{0,12}", value in "[a-c0-9:,\\[\\]{} \
+            &*]{0,12}") {
             let sources = Sources {
                 file_may_be_absent: true,
                 overrides: vec![("a".to_owned(), "[1, {b: 2}]".to_owned()), (path, value)],
@@ -255,11 +246,7 @@ mod watching {
 
     /// Polling alone.
     fn polling() -> WatchSettings {
-        WatchSettings {
-            poll: Duration::from_millis(20),
-            directory_events: false,
-            ..events()
-        }
+        WatchSettings { poll: Duration::from_millis(20), directory_events: false, ..events() }
     }
 
     type Told = Receiver<Current<(f64, String)>>;
@@ -272,7 +259,11 @@ mod watching {
         (supervisor, told)
     }
 
-    async fn until(told: &mut Told, what: &str, holds: impl FnMut(&Current<(f64, String)>) -> bool) {
+    async fn until(
+        told: &mut Told,
+        what: &str,
+        holds: impl FnMut(&Current<(f64, String)>) -> bool,
+    ) {
         let waited = tokio::time::timeout(Duration::from_secs(10), told.wait_for(holds)).await;
         assert!(waited.is_ok_and(|told| told.is_ok()), "{what}");
     }
@@ -334,15 +325,15 @@ mod watching {
             ("\n", ":1: has become empty"),
         ] {
             fs::write(&path, text).unwrap();
-            let fault = |now: &Current<(f64, String)>| texts(now.faults.as_deref().unwrap_or_default()).join("\n");
+            let fault = |now: &Current<(f64, String)>| {
+                texts(now.faults.as_deref().unwrap_or_default()).join("\n")
+            };
             until(&mut told, expected, |now| fault(now).contains(expected)).await;
             assert_eq!(told.borrow().loaded.value.0, 1.0);
         }
         fs::remove_file(&path).unwrap();
         let gone = |now: &Current<_>| {
-            now.faults
-                .iter()
-                .any(|faults| faults[0].detail.contains("cannot be opened"))
+            now.faults.iter().any(|faults| faults[0].detail.contains("cannot be opened"))
         };
         until(&mut told, "the file is gone", gone).await;
         fs::write(&path, "limit: 4\n").unwrap();
@@ -379,13 +370,8 @@ mod watching {
         fs::create_dir(&directory).unwrap();
         let path = directory.join("blaze.yaml");
         fs::write(&path, "limit: 1\n").unwrap();
-        let (_supervisor, mut told) = start(
-            &path,
-            WatchSettings {
-                poll: Duration::from_millis(50),
-                ..events()
-            },
-        );
+        let (_supervisor, mut told) =
+            start(&path, WatchSettings { poll: Duration::from_millis(50), ..events() });
         fs::rename(&directory, parent.path().join("old")).unwrap();
         fs::create_dir(&directory).unwrap();
         fs::write(&path, "limit: 2\n").unwrap();
@@ -399,14 +385,9 @@ mod watching {
         let directory = tempfile::tempdir().unwrap();
         let path = file(&directory, "limit: 1\n");
         // Registered before the signal is sent, whatever the watch has got to.
-        let _handler = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::hangup()).unwrap();
-        let (_supervisor, mut told) = start(
-            &path,
-            WatchSettings {
-                hangup: true,
-                ..polling()
-            },
-        );
+        let _handler =
+            tokio::signal::unix::signal(tokio::signal::unix::SignalKind::hangup()).unwrap();
+        let (_supervisor, mut told) = start(&path, WatchSettings { hangup: true, ..polling() });
         fs::write(&path, "limit: 2\n").unwrap();
         // The watch runs, so it has its handler.
         limit_becomes(&mut told, 2.0).await;

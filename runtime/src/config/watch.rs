@@ -1,7 +1,8 @@
 //! Reads the configuration again when its file or the overlay changes.
 //!
-//! Of the file there are three triggers, each enough alone: events of its directory (a Kubernetes ConfigMap swaps a symlink
-//! there, so the file itself is never written), SIGHUP, and a slow poll of the content that repairs what an event missed.
+//! Of the file there are three triggers, each enough alone: events of its directory (a Kubernetes
+//! ConfigMap swaps a symlink there, so the file itself is never written), SIGHUP, and a slow poll
+//! of the content that repairs what an event missed.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt;
@@ -82,8 +83,9 @@ impl<T> Clone for Current<T> {
     }
 }
 
-/// Watches the file of `sources` (which the caller has [pinned](Sources::pinned)) from `initial` on. Each change of the
-/// content and each SIGHUP is told to the receiver once, faulty or not; the last good value stays.
+/// Watches the file of `sources` (which the caller has [pinned](Sources::pinned)) from `initial`
+/// on. Each change of the content and each SIGHUP is told to the receiver once, faulty or not; the
+/// last good value stays.
 #[must_use]
 pub fn watch<T: Send + Sync + 'static>(
     supervisor: &Supervisor,
@@ -96,9 +98,9 @@ pub fn watch<T: Send + Sync + 'static>(
     watch_with(supervisor, sources, schema, initial, settings, nothing)
 }
 
-/// As [`watch`], with a tree over the file that changes while the program runs. A change of either is told once. What one of
-/// them says wrongly changes nothing and keeps the other from nothing; where both are good apart and faulty together, the
-/// later one does not count.
+/// As [`watch`], with a tree over the file that changes while the program runs. A change of either
+/// is told once. What one of them says wrongly changes nothing and keeps the other from nothing;
+/// where both are good apart and faulty together, the later one does not count.
 #[must_use]
 pub fn watch_with<T: Send + Sync + 'static>(
     supervisor: &Supervisor,
@@ -134,7 +136,11 @@ struct Task<T> {
 }
 
 impl<T: Send + Sync + 'static> Task<T> {
-    async fn run(mut self, settings: WatchSettings, mut overlays: channel::Receiver<Option<Overlay>>) {
+    async fn run(
+        mut self,
+        settings: WatchSettings,
+        mut overlays: channel::Receiver<Option<Overlay>>,
+    ) {
         let (events, mut changed) = mpsc::channel(1);
         let mut directories = Directories::new(settings.directory_events.then(|| events.clone()));
         let mut hangup = Hangup::new(settings.hangup);
@@ -188,8 +194,8 @@ impl<T: Send + Sync + 'static> Task<T> {
     }
 }
 
-/// Waits until nothing has changed for a while, but not for long: in a directory in which others write as well that may never be, and a
-/// change is to be in effect within a second.
+/// Waits until nothing has changed for a while, but not for long: in a directory in which others
+/// write as well that may never be, and a change is to be in effect within a second.
 async fn quiet(changed: &mut mpsc::Receiver<()>, debounce: Duration) {
     let latest = Instant::now() + debounce * 4;
     while Instant::now() < latest {
@@ -205,7 +211,12 @@ struct Hangup(Option<tokio::signal::unix::Signal>);
 impl Hangup {
     fn new(wanted: bool) -> Self {
         let register = || tokio::signal::unix::signal(tokio::signal::unix::SignalKind::hangup());
-        let failed = |error: &std::io::Error| tracing::warn!(%error, "SIGHUP will not reload the configuration");
+        let failed = |error: &std::io::Error| {
+            tracing::warn!(
+                %error,
+                "SIGHUP will not reload the configuration",
+            )
+        };
         Self(wanted.then(register).and_then(|signal| signal.inspect_err(failed).ok()))
     }
 
@@ -219,7 +230,8 @@ impl Hangup {
     }
 }
 
-/// The directories that are watched: that of the file as it is named, and that of the file that it leads to.
+/// The directories that are watched: that of the file as it is named, and that of the file that it
+/// leads to.
 struct Directories {
     watcher: Option<RecommendedWatcher>,
     /// Device and inode of each: another directory under the same name must be watched anew.
@@ -237,7 +249,10 @@ impl Directories {
             })
         };
         let failed = |error: &notify::Error| {
-            tracing::warn!(%error, "no directory events: changes of the configuration are found by polling");
+            tracing::warn!(
+                %error,
+                "no directory events: changes of the configuration are found by polling",
+            );
         };
         Self {
             watcher: events.and_then(|events| make(events).inspect_err(failed).ok()),
@@ -248,9 +263,7 @@ impl Directories {
     fn arm(&mut self, file: &Path) {
         let Some(watcher) = &mut self.watcher else { return };
         let named = Some(directory_of(file).to_owned());
-        let real = std::fs::canonicalize(file)
-            .ok()
-            .map(|real| directory_of(&real).to_owned());
+        let real = std::fs::canonicalize(file).ok().map(|real| directory_of(&real).to_owned());
         let wanted: BTreeMap<PathBuf, (u64, u64)> = [named, real]
             .into_iter()
             .flatten()
@@ -274,7 +287,13 @@ impl Directories {
                 Ok(()) => {
                     self.armed.insert(path, id);
                 }
-                Err(error) => tracing::debug!(%error, path = %path.display(), "directory is not watched, only polled"),
+                Err(error) => {
+                    tracing::debug!(
+                        %error,
+                        path = %path.display(),
+                        "directory is not watched, only polled",
+                    )
+                }
             }
         }
     }

@@ -1,8 +1,8 @@
 //! YAML text to trees of values, with the line of every value or fault.
 //!
-//! The core schema of YAML 1.2 (so `on` and `off` are texts). Anchors, aliases, duplicate keys, tags (but `!!str` in the
-//! configuration of a process) and directives other than `%YAML 1.2` are refused with their line: they make a text mean
-//! something else than it seems to say.
+//! The core schema of YAML 1.2 (so `on` and `off` are texts). Anchors, aliases, duplicate keys,
+//! tags (but `!!str` in the configuration of a process) and directives other than `%YAML 1.2` are
+//! refused with their line: they make a text mean something else than it seems to say.
 //!
 //! ```text
 //! a file of one document ──[parse]──▶ tree, place of every value, faults        (the configuration of a process)
@@ -47,17 +47,15 @@ pub(super) enum Origin {
 impl Origin {
     pub(super) fn place(&self, line: usize) -> Place {
         match self {
-            Self::File(file) => Place::File {
-                file: Arc::clone(file),
-                line,
-            },
+            Self::File(file) => Place::File { file: Arc::clone(file), line },
             Self::Single(place) => place.clone(),
             Self::Text => Place::Line(line),
         }
     }
 }
 
-/// Reads a text of one document whose root stands at `root` in the whole document (empty for a file).
+/// Reads a text of one document whose root stands at `root` in the whole document (empty for a
+/// file).
 pub(super) fn parse(text: &str, origin: &Origin, root: &str) -> Parsed {
     let mut places = Places::default();
     places.set(root, origin.place(1));
@@ -70,12 +68,13 @@ pub(super) fn parse(text: &str, origin: &Origin, root: &str) -> Parsed {
     }
 }
 
-/// Reads a text of several documents, split by `---`, such as `apply` takes. Empty documents are left out. Places of faults
-/// are lines of the text.
+/// Reads a text of several documents, split by `---`, such as `apply` takes. Empty documents are
+/// left out. Places of faults are lines of the text.
 ///
 /// # Errors
-/// Every fault of form: what is no YAML, repeated keys, anchors, aliases, tags, directives other than `%YAML 1.2`, nesting
-/// deeper than 32, numbers that cannot be held. More than `max_documents` are one fault ([`LocatedFault::is_too_many_documents`]).
+/// Every fault of form: what is no YAML, repeated keys, anchors, aliases, tags, directives other
+/// than `%YAML 1.2`, nesting deeper than 32, numbers that cannot be held. More than `max_documents`
+/// are one fault ([`LocatedFault::is_too_many_documents`]).
 pub fn yaml_documents(text: &str, max_documents: usize) -> Result<Vec<Value>, Vec<LocatedFault>> {
     let located = located_documents(text, max_documents)?;
     Ok(located.into_iter().map(|(_, value)| value).collect())
@@ -85,11 +84,11 @@ pub fn yaml_documents(text: &str, max_documents: usize) -> Result<Vec<Value>, Ve
 ///
 /// # Errors
 /// As [`yaml_documents`].
-pub fn located_documents(text: &str, max_documents: usize) -> Result<Vec<(usize, Value)>, Vec<LocatedFault>> {
-    let documents = Documents::Many {
-        limit: max_documents,
-        finished: Vec::new(),
-    };
+pub fn located_documents(
+    text: &str,
+    max_documents: usize,
+) -> Result<Vec<(usize, Value)>, Vec<LocatedFault>> {
+    let documents = Documents::Many { limit: max_documents, finished: Vec::new() };
     let origin = Origin::Text;
     let mut builder = Builder::new(&origin, "", documents, None);
     builder.read(text.strip_prefix('\u{feff}').unwrap_or(text));
@@ -102,7 +101,8 @@ pub fn located_documents(text: &str, max_documents: usize) -> Result<Vec<(usize,
 /// The text cannot be read further.
 struct Stop;
 
-/// Finds directives, which the parser follows and does not tell of. They stand between two documents.
+/// Finds directives, which the parser follows and does not tell of. They stand between two
+/// documents.
 struct Directives<'a> {
     /// Where it has come to.
     rest: &'a str,
@@ -114,11 +114,7 @@ struct Directives<'a> {
 
 impl<'a> Directives<'a> {
     fn of(text: &'a str) -> Self {
-        Self {
-            rest: text,
-            line: 1,
-            end: 1,
-        }
+        Self { rest: text, line: 1, end: 1 }
     }
 
     /// Lines of directives that are not taken, before a document that begins.
@@ -198,7 +194,12 @@ struct Builder<'a> {
 }
 
 impl<'a> Builder<'a> {
-    fn new(origin: &'a Origin, root: &'a str, documents: Documents, places: Option<Places>) -> Self {
+    fn new(
+        origin: &'a Origin,
+        root: &'a str,
+        documents: Documents,
+        places: Option<Places>,
+    ) -> Self {
         Self {
             origin,
             root,
@@ -265,13 +266,11 @@ impl<'a> Builder<'a> {
                 self.put(value);
                 Ok(())
             }
-            Event::SequenceStart(anchor, tag) => self.open(Open::List(Vec::new()), anchor, tag.as_deref(), line),
+            Event::SequenceStart(anchor, tag) => {
+                self.open(Open::List(Vec::new()), anchor, tag.as_deref(), line)
+            }
             Event::MappingStart(anchor, tag) => {
-                let map = Open::Map {
-                    entries: Map::new(),
-                    key: None,
-                    seen: HashSet::new(),
-                };
+                let map = Open::Map { entries: Map::new(), key: None, seen: HashSet::new() };
                 self.open(map, anchor, tag.as_deref(), line)
             }
             Event::SequenceEnd | Event::MappingEnd => {
@@ -318,7 +317,8 @@ impl<'a> Builder<'a> {
 
     fn key(&mut self, name: String, line: usize) -> Result<(), Stop> {
         if name.len() > MAX_KEY_BYTES {
-            let detail = format!("has a key of {} bytes, at most {MAX_KEY_BYTES} are allowed", name.len());
+            let detail =
+                format!("has a key of {} bytes, at most {MAX_KEY_BYTES} are allowed", name.len());
             self.fault(line, self.here(), detail);
             return Err(Stop);
         }
@@ -339,17 +339,19 @@ impl<'a> Builder<'a> {
             return Err(Stop);
         }
         let line = self.line_of_value(line);
-        self.fault(
-            line,
-            self.here(),
-            "aliases (*name) are not allowed: write the value out",
-        );
+        self.fault(line, self.here(), "aliases (*name) are not allowed: write the value out");
         self.note_place(line);
         self.put(Value::Null);
         Ok(())
     }
 
-    fn open(&mut self, open: Open, anchor: usize, tag: Option<&Tag>, line: usize) -> Result<(), Stop> {
+    fn open(
+        &mut self,
+        open: Open,
+        anchor: usize,
+        tag: Option<&Tag>,
+        line: usize,
+    ) -> Result<(), Stop> {
         self.refuse_anchor(anchor, line);
         if self.wants_key() {
             self.fault(line, self.here(), "a key must be text");
@@ -378,11 +380,7 @@ impl<'a> Builder<'a> {
 
     fn refuse_anchor(&mut self, anchor: usize, line: usize) {
         if anchor != 0 {
-            self.fault(
-                line,
-                self.here(),
-                "anchors (&name) are not allowed: write the value out",
-            );
+            self.fault(line, self.here(), "anchors (&name) are not allowed: write the value out");
         }
     }
 
@@ -397,7 +395,8 @@ impl<'a> Builder<'a> {
         self.fault(line, self.here(), detail);
     }
 
-    /// The path of what is read now. It is put together only where it is needed, for it may be long.
+    /// The path of what is read now. It is put together only where it is needed, for it may be
+    /// long.
     fn here(&self) -> String {
         let mut path = self.root.to_owned();
         for open in &self.stack {
@@ -410,8 +409,8 @@ impl<'a> Builder<'a> {
         path
     }
 
-    /// Line of the next value. A value of a mapping has the line of its key: there a person looks first, and an absent
-    /// value has no line of its own.
+    /// Line of the next value. A value of a mapping has the line of its key: there a person looks
+    /// first, and an absent value has no line of its own.
     fn line_of_value(&self, line: usize) -> usize {
         match self.stack.last() {
             Some(Open::Map { key: Some(key), .. }) => key.line,
@@ -419,8 +418,8 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// Notes where the next value stands. The first place of a path stays, so that a repeated key does not hide the first
-    /// one.
+    /// Notes where the next value stands. The first place of a path stays, so that a repeated key
+    /// does not hide the first one.
     fn note_place(&mut self, line: usize) {
         if self.stack.is_empty() {
             self.begins = line;
@@ -429,10 +428,8 @@ impl<'a> Builder<'a> {
             return;
         }
         let (path, place) = (self.here(), self.origin.place(line));
-        if let Some(places) = self
-            .places
-            .as_mut()
-            .filter(|places| path == self.root || !places.knows(&path))
+        if let Some(places) =
+            self.places.as_mut().filter(|places| path == self.root || !places.knows(&path))
         {
             places.set(&path, place);
         }

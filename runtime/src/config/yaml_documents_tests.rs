@@ -8,11 +8,7 @@ fn read(text: &str) -> Vec<Value> {
 }
 
 fn faults(text: &str) -> Vec<String> {
-    yaml_documents(text, 100)
-        .unwrap_err()
-        .iter()
-        .map(ToString::to_string)
-        .collect()
+    yaml_documents(text, 100).unwrap_err().iter().map(ToString::to_string).collect()
 }
 
 #[test]
@@ -74,14 +70,8 @@ fn faults_have_the_line_of_the_text() {
         ]
     );
     assert!(faults("a: 1\n---\nb: [1\nc: 2\n")[0].starts_with("line 4: is not YAML: "));
-    assert_eq!(
-        faults("a: 100000000000000000000\n"),
-        ["line 1: a: is a number too large to hold"]
-    );
-    assert_eq!(
-        faults("list:\n- a: {b: .inf}\n"),
-        ["line 2: list[0].a.b: is not a finite number"]
-    );
+    assert_eq!(faults("a: 100000000000000000000\n"), ["line 1: a: is a number too large to hold"]);
+    assert_eq!(faults("list:\n- a: {b: .inf}\n"), ["line 2: list[0].a.b: is not a finite number"]);
 }
 
 #[test]
@@ -89,9 +79,7 @@ fn no_tag_is_taken() {
     for tag in ["!!str", "!!int", "!", "!own", "!<tag:yaml.org,2002:str>"] {
         for text in [format!("a: {tag} 1\n"), format!("{tag} a: 1\n"), format!("{tag} 1\n")] {
             assert!(
-                faults(&text)
-                    .iter()
-                    .any(|fault| fault.ends_with("tags are not allowed")),
+                faults(&text).iter().any(|fault| fault.ends_with("tags are not allowed")),
                 "{text}: {:?}",
                 faults(&text)
             );
@@ -140,12 +128,8 @@ fn documents_are_counted() {
 fn large_texts_take_time_in_proportion() {
     // Each of many values below a long key: the path must not be put together for each.
     let rows = "  - {v: 1}\n".repeat(50_000);
-    let text = format!(
-        "{}:\n  {}:\n{}",
-        "k".repeat(1000),
-        "m".repeat(1000),
-        rows.replace("  -", "   -")
-    );
+    let text =
+        format!("{}:\n  {}:\n{}", "k".repeat(1000), "m".repeat(1000), rows.replace("  -", "   -"));
     assert_eq!(read(&text).len(), 1);
 }
 
@@ -156,8 +140,10 @@ proptest! {
     }
 
     #[test]
-    fn every_document_reads_as_it_does_alone(numbers in prop::collection::vec(any::<i64>(), 0..6), text in "[a-z \"\\\\\n\u{e4}]{0,20}") {
-        let trees: Vec<Value> = numbers.iter().map(|number| json!({ "n": number, "t": text, "l": [[], {}] })).collect();
+    fn every_document_reads_as_it_does_alone(numbers in prop::collection::vec(any::<i64>(), 0..6),
+        text in "[a-z \"\\\\\n\u{e4}]{0,20}") {
+        let trees: Vec<Value> =
+            numbers.iter().map(|number| json!({ "n": number, "t": text, "l": [[], {}] })).collect();
         let joined: String = trees.iter().map(|tree| format!("---\n{tree}\n")).collect();
         prop_assert_eq!(yaml_documents(&joined, 6).unwrap(), trees);
     }

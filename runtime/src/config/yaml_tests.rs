@@ -60,18 +60,12 @@ fn what_misleads_is_refused_with_its_line() {
             "f:4: d: is not a finite number",
         ]
     );
-    assert_eq!(
-        faults("!!int 1: a\n!!str b: 1\n"),
-        ["f:1: tags other than !!str are not allowed"]
-    );
+    assert_eq!(faults("!!int 1: a\n!!str b: 1\n"), ["f:1: tags other than !!str are not allowed"]);
     assert_eq!(
         faults("%YAML 1.1\n---\na: off\n"),
         ["f:1: directives other than %YAML 1.2 are not allowed"]
     );
-    assert_eq!(
-        faults("a: 1\n---\nb: 2\n"),
-        ["f:2: holds a second document; one is allowed"]
-    );
+    assert_eq!(faults("a: 1\n---\nb: 2\n"), ["f:2: holds a second document; one is allowed"]);
     assert_eq!(faults("a:\n  ? [x]\n  : 1\n"), ["f:2: a: a key must be text"]);
     assert!(
         faults("a: 1\nb: [1, 2\nc: 3\n")[0].starts_with("f:3: is not YAML: "),
@@ -93,10 +87,7 @@ fn keys_are_bounded() {
     let key = |length: usize| format!("{}: 1\n", "k".repeat(length));
     assert_eq!(faults(&key(MAX_KEY_BYTES - 2)), [""; 0]);
     let long = format!("? {}\n: 1\n", "k".repeat(MAX_KEY_BYTES + 1));
-    assert_eq!(
-        faults(&long),
-        ["f:1: has a key of 1025 bytes, at most 1024 are allowed"]
-    );
+    assert_eq!(faults(&long), ["f:1: has a key of 1025 bytes, at most 1024 are allowed"]);
 }
 
 #[test]
@@ -122,8 +113,13 @@ proptest! {
     }
 
     #[test]
-    fn json_is_yaml(numbers in prop::collection::vec(any::<i64>(), 0..5), text in "[a-z \"\\\\\n\u{e4}]{0,20}") {
-        let tree = json!({ "numbers": numbers, "text": text, "inner": { "list": [[], {}, null, true] } });
+    fn json_is_yaml(numbers in prop::collection::vec(any::<i64>(), 0..5),
+        text in "[a-z \"\\\\\n\u{e4}]{0,20}") {
+        let tree = json!({
+            "numbers": numbers,
+            "text": text,
+            "inner": { "list": [[], {}, null, true] },
+        });
         prop_assert_eq!(value(&serde_json::to_string_pretty(&tree).unwrap()), tree);
     }
 }

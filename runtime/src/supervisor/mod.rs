@@ -87,8 +87,9 @@ impl Supervisor {
         }
     }
 
-    /// A part of this one that can be shut down alone. Its failure is a failure of the whole; the whole's shutdown is
-    /// also its own. For a part that may fail alone make an independent supervisor.
+    /// A part of this one that can be shut down alone. Its failure is a failure of the whole; the
+    /// whole's shutdown is also its own. For a part that may fail alone make an independent
+    /// supervisor.
     #[must_use]
     pub fn child(&self, name: impl Into<String>) -> Self {
         let child = Self::build(self.shared.runtime.clone(), name.into(), Some(self.clone()));
@@ -130,7 +131,12 @@ impl Supervisor {
     ///
     /// # Errors
     /// If the system gives no thread.
-    pub fn spawn_thread<F, O>(&self, name: impl Into<String>, policy: TaskPolicy, run: F) -> std::io::Result<TaskHandle>
+    pub fn spawn_thread<F, O>(
+        &self,
+        name: impl Into<String>,
+        policy: TaskPolicy,
+        run: F,
+    ) -> std::io::Result<TaskHandle>
     where
         F: FnOnce() -> O + Send + 'static,
         O: TaskEnd,
@@ -145,7 +151,12 @@ impl Supervisor {
         Ok(TaskHandle::new(self, id, None, finished))
     }
 
-    fn register(&self, name: String, policy: TaskPolicy, thread: bool) -> (task::Observer, CancellationToken) {
+    fn register(
+        &self,
+        name: String,
+        policy: TaskPolicy,
+        thread: bool,
+    ) -> (task::Observer, CancellationToken) {
         let shared = &self.shared;
         let id = shared.next_id.fetch_add(1, Ordering::Relaxed);
         let finished = CancellationToken::new();
@@ -160,16 +171,13 @@ impl Supervisor {
         let name = Arc::clone(&entry.name);
         shared.tasks.lock().insert(id, entry);
         shared.running.send_modify(|running| *running += 1);
-        let observer = task::Observer {
-            supervisor: self.clone(),
-            id,
-            name,
-            finished: finished.clone(),
-        };
+        let observer =
+            task::Observer { supervisor: self.clone(), id, name, finished: finished.clone() };
         (observer, finished)
     }
 
-    /// Cancelled when all tasks shall end by themselves: after the steps of the shutdown, before the deadline.
+    /// Cancelled when all tasks shall end by themselves: after the steps of the shutdown, before
+    /// the deadline.
     #[must_use]
     pub fn shutdown_token(&self) -> CancellationToken {
         self.shared.shutdown.clone()
@@ -216,7 +224,8 @@ impl Supervisor {
     /// What runs now, with that of children, oldest first.
     #[must_use]
     pub fn running(&self) -> Vec<TaskInfo> {
-        let mut out: Vec<TaskInfo> = self.shared.tasks.lock().values().map(task::Entry::info).collect();
+        let mut out: Vec<TaskInfo> =
+            self.shared.tasks.lock().values().map(task::Entry::info).collect();
         for child in self.children() {
             let name = child.name().to_owned();
             out.extend(child.running().into_iter().map(|mut info| {

@@ -22,7 +22,8 @@ pub mod exit_code {
 /// Threads of the runtime that block get this long at the end of the process.
 const AFTER_MAIN: Duration = Duration::from_millis(500);
 
-/// Runs the main future of a process on a runtime of its own; what then still blocks a thread does not hold it up.
+/// Runs the main future of a process on a runtime of its own; what then still blocks a thread does
+/// not hold it up.
 ///
 /// # Errors
 /// If the system gives no threads.
@@ -59,11 +60,17 @@ impl Supervisor {
             report = self.shutdown_with(steps) => report,
             (name, number) = signals.recv() => {
                 say(format_args!("{}: {name} during the shutdown, exiting at once", self.name()));
-                std::process::exit(if failure.is_some() { i32::from(exit_code::FAILED) } else { 128 + number });
+                std::process::exit(if failure
+                    .is_some() { i32::from(exit_code::FAILED) } else { 128 + number });
             }
         };
         if !report.is_clean() {
-            tracing::warn!(?report.unfinished_steps, ?report.aborted, ?report.left, "the shutdown reached its deadline");
+            tracing::warn!(
+                ?report.unfinished_steps,
+                ?report.aborted,
+                ?report.left,
+                "the shutdown reached its deadline",
+            );
         }
         // A panic while draining is a failure too, though nothing waited for it.
         match (failure, self.failure()) {

@@ -36,10 +36,7 @@ impl ShutdownSteps {
     /// No steps; everything is over after `deadline`.
     #[must_use]
     pub fn new(deadline: Duration) -> Self {
-        Self {
-            deadline,
-            steps: Vec::new(),
-        }
+        Self { deadline, steps: Vec::new() }
     }
 
     /// One more step. Steps of one phase run in the order in which they were added.
@@ -75,7 +72,8 @@ impl ShutdownReport {
 }
 
 impl Supervisor {
-    /// Ends all tasks of this supervisor and its children; at the deadline those that are left are aborted.
+    /// Ends all tasks of this supervisor and its children; at the deadline those that are left are
+    /// aborted.
     pub async fn shutdown(&self, deadline: Duration) -> ShutdownReport {
         self.shutdown_with(ShutdownSteps::new(deadline)).await
     }
@@ -130,10 +128,7 @@ impl Supervisor {
         }
         for child in self.children() {
             names.extend(
-                child
-                    .abort_all()
-                    .into_iter()
-                    .map(|name| format!("{}/{name}", child.name())),
+                child.abort_all().into_iter().map(|name| format!("{}/{name}", child.name())),
             );
         }
         names

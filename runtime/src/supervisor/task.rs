@@ -90,15 +90,11 @@ impl TaskHandle {
         abort: Option<AbortHandle>,
         finished: CancellationToken,
     ) -> Self {
-        Self {
-            supervisor: supervisor.clone(),
-            id,
-            abort,
-            finished,
-        }
+        Self { supervisor: supervisor.clone(), id, abort, finished }
     }
 
-    /// Ends the task at its next await, without that being a failure. A thread is only allowed to end.
+    /// Ends the task at its next await, without that being a failure. A thread is only allowed to
+    /// end.
     pub fn stop(&self) {
         if let Some(entry) = self.supervisor.shared.tasks.lock().get_mut(&self.id) {
             entry.stopped = true;
@@ -204,7 +200,8 @@ where
     F: Future,
     F::Output: TaskEnd,
 {
-    // Declared after the observer, so dropped before it: `finished` means that nothing of the task is left.
+    // Declared after the observer, so dropped before it: `finished` means that nothing of the task
+    // is left.
     let mut future = Some(Box::pin(future));
     let end = std::future::poll_fn(|context| {
         let Some(running) = future.as_mut() else {

@@ -14,7 +14,10 @@ async fn soon<F: Future>(what: &str, future: F) -> F::Output {
     }
 }
 
-async fn failure_of(policy: TaskPolicy, act: impl FnOnce() -> Result<(), String> + Send + 'static) -> Option<String> {
+async fn failure_of(
+    policy: TaskPolicy,
+    act: impl FnOnce() -> Result<(), String> + Send + 'static,
+) -> Option<String> {
     let supervisor = Supervisor::new("test");
     let handle = supervisor.spawn("pacer", policy, async move { act() });
     soon("end of the task", handle.finished()).await;
@@ -25,10 +28,7 @@ async fn failure_of(policy: TaskPolicy, act: impl FnOnce() -> Result<(), String>
 #[tokio::test]
 async fn the_end_of_an_essential_task_is_a_failure() {
     use TaskPolicy::{Essential, MayEnd};
-    assert_eq!(
-        failure_of(Essential, || Ok(())).await.as_deref(),
-        Some("pacer ended unexpectedly")
-    );
+    assert_eq!(failure_of(Essential, || Ok(())).await.as_deref(), Some("pacer ended unexpectedly"));
     assert_eq!(
         failure_of(Essential, || Err("disk full".into())).await.as_deref(),
         Some("pacer failed: disk full")
@@ -39,10 +39,7 @@ async fn the_end_of_an_essential_task_is_a_failure() {
     );
     assert_eq!(failure_of(MayEnd, || Ok(())).await, None);
     assert_eq!(failure_of(MayEnd, || Err("disk full".into())).await, None);
-    assert_eq!(
-        failure_of(MayEnd, || panic!("bug")).await.as_deref(),
-        Some("pacer panicked: bug")
-    );
+    assert_eq!(failure_of(MayEnd, || panic!("bug")).await.as_deref(), Some("pacer panicked: bug"));
 }
 
 #[tokio::test]
@@ -85,10 +82,7 @@ async fn a_stopped_task_is_no_failure_and_drops_what_it_held() {
         std::future::pending::<()>().await;
     });
     let running = supervisor.running();
-    assert_eq!(
-        (running.len(), running[0].name.as_str(), running[0].thread),
-        (1, "bridge", false)
-    );
+    assert_eq!((running.len(), running[0].name.as_str(), running[0].thread), (1, "bridge", false));
     drop(handle.clone().stop_on_drop());
     soon("end of the task", handle.finished()).await;
     assert!(dropped.load(Ordering::SeqCst));
@@ -182,7 +176,8 @@ async fn tasks_can_be_spawned_from_threads() {
     assert_eq!(soon("answer", told).await.unwrap(), 7);
 }
 
-/// The scenario that [`child_process`] plays, in a process of its own because it is about signals and exit codes.
+/// The scenario that [`child_process`] plays, in a process of its own because it is about signals
+/// and exit codes.
 const SCENARIO: &str = "BLAZE_TEST_SUPERVISOR_SCENARIO";
 
 #[test]
@@ -225,12 +220,7 @@ async fn futures_join<A: Future, B: Future>(a: A, b: B) -> (A::Output, B::Output
 fn play(scenario: &str, signals: &[(&str, &str)]) -> (ExitStatus, String) {
     use std::io::{BufRead, BufReader};
     let mut child = Command::new(std::env::current_exe().unwrap())
-        .args([
-            "--exact",
-            "supervisor::tests::child_process",
-            "--ignored",
-            "--nocapture",
-        ])
+        .args(["--exact", "supervisor::tests::child_process", "--ignored", "--nocapture"])
         .env(SCENARIO, scenario)
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
@@ -242,10 +232,8 @@ fn play(scenario: &str, signals: &[(&str, &str)]) -> (ExitStatus, String) {
     for line in BufReader::new(child.stderr.take().unwrap()).lines() {
         let line = line.unwrap();
         if let Some((_, signal)) = next.filter(|(expected, _)| line.contains(expected)) {
-            let sent = Command::new("kill")
-                .args([*signal, &child.id().to_string()])
-                .status()
-                .unwrap();
+            let sent =
+                Command::new("kill").args([*signal, &child.id().to_string()]).status().unwrap();
             assert!(sent.success());
             next = signals.next();
         }
@@ -267,9 +255,7 @@ fn a_failed_task_ends_with_1_and_one_line() {
     let (status, said) = play("fail", &[]);
     assert_eq!(status.code(), Some(1), "{said}");
     assert_eq!(
-        said.lines()
-            .filter(|line| *line == "blaze-test failed: pacer ended unexpectedly")
-            .count(),
+        said.lines().filter(|line| *line == "blaze-test failed: pacer ended unexpectedly").count(),
         1,
         "{said}"
     );

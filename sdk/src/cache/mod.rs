@@ -81,7 +81,8 @@ fn names(services: &[ServiceName]) -> String {
 /// Whether others can see that the service lives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Liveness {
-    /// It does not say so: nobody called [`CacheManager::set_state`], or it has no node to be named by.
+    /// It does not say so: nobody called [`CacheManager::set_state`], or it has no node to be named
+    /// by.
     Off,
     /// It said so lately.
     Alive,
@@ -99,7 +100,8 @@ pub(crate) struct WatchdogOptions {
     pub(crate) version: String,
     /// How long a sign counts.
     pub(crate) ttl: Duration,
-    /// The number of its life is the time at which it began. Clocks go back; whoever begins is the newer one all the same.
+    /// The number of its life is the time at which it began. Clocks go back; whoever begins is the
+    /// newer one all the same.
     pub(crate) by_clock: bool,
 }
 
@@ -170,8 +172,9 @@ impl CacheManager {
         Self { shared }
     }
 
-    /// Says how the service is: at once, and again every third of `watchdog_ttl`. The first call begins it; a service that
-    /// never calls it is not watched by anybody. `Stopping` does not end it: that does [`crate::ServiceManager::shutdown`].
+    /// Says how the service is: at once, and again every third of `watchdog_ttl`. The first call
+    /// begins it; a service that never calls it is not watched by anybody. `Stopping` does not end
+    /// it: that does [`crate::ServiceManager::shutdown`].
     pub fn set_state(&self, state: ServiceState) {
         {
             let mut said = self.shared.said.lock();
@@ -193,23 +196,27 @@ impl CacheManager {
         self.shared.liveness.subscribe()
     }
 
-    /// Waits until each of these services has an instance that is `ready`, on whatever node, at the same time. Without Redis
-    /// it hears of them at their pace: a third of their time to live, by default 5 s.
+    /// Waits until each of these services has an instance that is `ready`, on whatever node, at the
+    /// same time. Without Redis it hears of them at their pace: a third of their time to live, by
+    /// default 5 s.
     ///
     /// # Errors
     /// [`CacheError::NotReady`] names those that are not; [`CacheError::Broker`].
-    pub async fn wait_for(&self, services: &[ServiceName], timeout: Duration) -> Result<(), CacheError> {
+    pub async fn wait_for(
+        &self,
+        services: &[ServiceName],
+        timeout: Duration,
+    ) -> Result<(), CacheError> {
         let missing = Mutex::new(services.to_vec());
-        match tokio::time::timeout(timeout, watchdog::wait(&self.shared, services, &missing)).await {
+        match tokio::time::timeout(timeout, watchdog::wait(&self.shared, services, &missing)).await
+        {
             Ok(result) => Ok(result?),
-            Err(_) => Err(CacheError::NotReady {
-                services: missing.into_inner(),
-                within: timeout,
-            }),
+            Err(_) => Err(CacheError::NotReady { services: missing.into_inner(), within: timeout }),
         }
     }
 
-    /// A value that this service, whichever instance of it, has put there; `None` if there is none or its time is over.
+    /// A value that this service, whichever instance of it, has put there; `None` if there is none
+    /// or its time is over.
     ///
     /// # Errors
     /// [`CacheError::None`], [`CacheError::Key`] or [`CacheError::Invalid`].
@@ -218,7 +225,8 @@ impl CacheManager {
         Ok(self.store()?.get(&key).await?)
     }
 
-    /// Keeps a value of at most 1 MiB for 1 ms to 30 days. The key has 1 to 200 bytes and belongs to this service.
+    /// Keeps a value of at most 1 MiB for 1 ms to 30 days. The key has 1 to 200 bytes and belongs
+    /// to this service.
     ///
     /// # Errors
     /// As [`CacheManager::get`].
@@ -226,7 +234,8 @@ impl CacheManager {
         let invalid = |what, reason: String| CacheError::Invalid { what, reason };
         let key = self.key(key)?;
         if value.len() > MAX_CACHE_VALUE_BYTES {
-            let reason = format!("has {} bytes, at most {MAX_CACHE_VALUE_BYTES} are allowed", value.len());
+            let reason =
+                format!("has {} bytes, at most {MAX_CACHE_VALUE_BYTES} are allowed", value.len());
             return Err(invalid("the value", reason));
         }
         if !(Duration::from_millis(1)..=MAX_CACHE_TIME).contains(&expires) {
@@ -244,7 +253,9 @@ impl CacheManager {
         if key.is_empty() || key.len() > MAX_CACHE_KEY_BYTES || key.chars().any(char::is_control) {
             return Err(CacheError::Invalid {
                 what: "the key",
-                reason: format!("must have 1 to {MAX_CACHE_KEY_BYTES} bytes and no control characters"),
+                reason: format!(
+                    "must have 1 to {MAX_CACHE_KEY_BYTES} bytes and no control characters"
+                ),
             });
         }
         Ok(format!("blaze:cache:{}:{key}", self.shared.identity.service))

@@ -25,11 +25,7 @@ pub(super) fn beginning(service: &str) -> String {
 /// Key of the record of an instance; `None` where it has no node to be named by.
 pub(super) fn key(identity: &Identity) -> Option<String> {
     let node = identity.node.as_ref()?;
-    Some(format!(
-        "{}{node}:{}",
-        beginning(identity.service.as_str()),
-        identity.instance
-    ))
+    Some(format!("{}{node}:{}", beginning(identity.service.as_str()), identity.instance))
 }
 
 /// What is said of an instance.
@@ -170,8 +166,10 @@ mod tests {
         let message: Value = serde_json::from_str(&sign.message(Duration::from_secs(15))).unwrap();
         assert_eq!(
             message,
-            json!({"layer": "edge", "node": "robot-1", "service": "slam", "instance": "0", "epoch": 17, "state": "ready",
-                "since_ms": 5, "version": "1.2.3", "config_revision": 431, "config_hash": "sha256:a", "ttl_ms": 15000})
+            json!({"layer": "edge", "node": "robot-1", "service": "slam", "instance": "0",
+                "epoch": 17, "state": "ready",
+                "since_ms": 5, "version": "1.2.3", "config_revision": 431,
+                "config_hash": "sha256:a", "ttl_ms": 15000})
         );
         assert_eq!(key(&identity).unwrap(), "blaze:watchdog:slam:robot-1:0");
         let heard = Heard::parse(message.to_string().as_bytes()).unwrap();
@@ -183,7 +181,13 @@ mod tests {
         for bytes in [&b""[..], b"{}", b"[]", b"7", b"{\"service\":\"slam\"}", b"\xff"] {
             assert_eq!(Heard::parse(bytes), None);
         }
-        let for_ever = json!({"service": "a", "node": "b", "instance": "0", "state": "ready", "ttl_ms": u64::MAX});
+        let for_ever = json!({
+            "service": "a",
+            "node": "b",
+            "instance": "0",
+            "state": "ready",
+            "ttl_ms": u64::MAX,
+        });
         let heard = Heard::parse(for_ever.to_string().as_bytes()).unwrap();
         assert_eq!(heard.ttl, Duration::from_millis(MAX_TTL_MS));
     }

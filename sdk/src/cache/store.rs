@@ -12,9 +12,18 @@ pub(crate) trait Store: Send + Sync + 'static {
     /// A record; `None` if there is none.
     async fn record(&self, key: &str) -> Result<Option<Record>, KeyError>;
     /// Records whose key begins so, at most so many.
-    async fn records(&self, beginning: &str, most: usize) -> Result<Vec<(String, Record)>, KeyError>;
+    async fn records(
+        &self,
+        beginning: &str,
+        most: usize,
+    ) -> Result<Vec<(String, Record)>, KeyError>;
     /// A record with these members and no others, for so long.
-    async fn put_record(&self, key: &str, members: Record, expires: Duration) -> Result<(), KeyError>;
+    async fn put_record(
+        &self,
+        key: &str,
+        members: Record,
+        expires: Duration,
+    ) -> Result<(), KeyError>;
     /// There is no such record of this epoch.
     async fn delete_record(&self, key: &str, epoch: &str) -> Result<(), KeyError>;
     /// The value of a key.
@@ -29,11 +38,20 @@ impl Store for RedisKeys {
         Self::record(self, key).await
     }
 
-    async fn records(&self, beginning: &str, most: usize) -> Result<Vec<(String, Record)>, KeyError> {
+    async fn records(
+        &self,
+        beginning: &str,
+        most: usize,
+    ) -> Result<Vec<(String, Record)>, KeyError> {
         Self::records(self, beginning, most).await
     }
 
-    async fn put_record(&self, key: &str, members: Record, expires: Duration) -> Result<(), KeyError> {
+    async fn put_record(
+        &self,
+        key: &str,
+        members: Record,
+        expires: Duration,
+    ) -> Result<(), KeyError> {
         let key = key.to_owned();
         self.apply(&[KeyChange::PutRecord { key, members, expires }], &[]).await
     }

@@ -27,10 +27,9 @@ struct Keys {
 impl Keys {
     fn reach(&self) -> Result<(), KeyError> {
         match *self.is_away.lock() {
-            true => Err(KeyError::Away {
-                place: "here".to_owned(),
-                reason: "switched off".to_owned(),
-            }),
+            true => {
+                Err(KeyError::Away { place: "here".to_owned(), reason: "switched off".to_owned() })
+            }
             false => Ok(()),
         }
     }
@@ -51,27 +50,27 @@ impl Store for Keys {
         Ok(self.now(key))
     }
 
-    async fn records(&self, beginning: &str, most: usize) -> Result<Vec<(String, Record)>, KeyError> {
+    async fn records(
+        &self,
+        beginning: &str,
+        most: usize,
+    ) -> Result<Vec<(String, Record)>, KeyError> {
         self.reach()?;
-        let keys: Vec<String> = self
-            .records
-            .lock()
-            .keys()
-            .filter(|key| key.starts_with(beginning))
-            .cloned()
-            .collect();
-        let found = keys
-            .into_iter()
-            .filter_map(|key| self.now(&key).map(|record| (key, record)));
+        let keys: Vec<String> =
+            self.records.lock().keys().filter(|key| key.starts_with(beginning)).cloned().collect();
+        let found = keys.into_iter().filter_map(|key| self.now(&key).map(|record| (key, record)));
         Ok(found.take(most).collect())
     }
 
-    async fn put_record(&self, key: &str, members: Record, expires: Duration) -> Result<(), KeyError> {
+    async fn put_record(
+        &self,
+        key: &str,
+        members: Record,
+        expires: Duration,
+    ) -> Result<(), KeyError> {
         self.reach()?;
         self.writes.lock().push(Instant::now());
-        self.records
-            .lock()
-            .insert(key.to_owned(), (members, Instant::now() + expires));
+        self.records.lock().insert(key.to_owned(), (members, Instant::now() + expires));
         Ok(())
     }
 
@@ -95,9 +94,7 @@ impl Store for Keys {
 
     async fn put(&self, key: &str, value: &Bytes, expires: Duration) -> Result<(), KeyError> {
         self.reach()?;
-        self.values
-            .lock()
-            .insert(key.to_owned(), (value.clone(), Instant::now() + expires));
+        self.values.lock().insert(key.to_owned(), (value.clone(), Instant::now() + expires));
         Ok(())
     }
 }
@@ -125,11 +122,7 @@ impl World {
     }
 
     fn service_by(&self, name: &str, epoch: u64, has_keys: bool, by_clock: bool) -> CacheManager {
-        let identity = Identity {
-            service: name.parse().unwrap(),
-            epoch,
-            ..slam()
-        };
+        let identity = Identity { service: name.parse().unwrap(), epoch, ..slam() };
         let broker: Arc<dyn Broker> = Arc::new(self.hub.broker());
         let config = ConfigManager::start(
             identity.clone(),
@@ -143,11 +136,7 @@ impl World {
             identity,
             broker,
             store,
-            WatchdogOptions {
-                version: "1.2.3".to_owned(),
-                ttl: TTL,
-                by_clock,
-            },
+            WatchdogOptions { version: "1.2.3".to_owned(), ttl: TTL, by_clock },
             config.shown(),
             &self.supervisor,
         )
@@ -255,11 +244,10 @@ async fn it_waits_until_all_are_ready_and_names_those_that_are_not() {
     for has_keys in [true, false] {
         let world = World::new();
         let waits = world.service("slam", 1, has_keys);
-        let names: Vec<ServiceName> = vec!["blaze-config".parse().unwrap(), "blaze-flow".parse().unwrap()];
-        let (config, flow) = (
-            world.service("blaze-config", 1, has_keys),
-            world.service("blaze-flow", 1, has_keys),
-        );
+        let names: Vec<ServiceName> =
+            vec!["blaze-config".parse().unwrap(), "blaze-flow".parse().unwrap()];
+        let (config, flow) =
+            (world.service("blaze-config", 1, has_keys), world.service("blaze-flow", 1, has_keys));
         config.set_state(ServiceState::Ready);
         flow.set_state(ServiceState::Starting);
         let within = Duration::from_secs(20);
@@ -288,9 +276,7 @@ async fn it_waits_until_all_are_ready_and_names_those_that_are_not() {
 async fn a_value_is_there_for_its_time_and_belongs_to_its_service() {
     let world = World::new();
     let (slam, nav) = (world.service("slam", 1, true), world.service("nav", 1, true));
-    slam.put("map", Bytes::from("m"), Duration::from_secs(10))
-        .await
-        .unwrap();
+    slam.put("map", Bytes::from("m"), Duration::from_secs(10)).await.unwrap();
     assert_eq!(slam.get("map").await, Ok(Some(Bytes::from("m"))));
     assert_eq!(nav.get("map").await, Ok(None));
     tokio::time::sleep(Duration::from_secs(11)).await;

@@ -14,9 +14,7 @@ const MAX_INSTANCES: usize = 4_096;
 
 /// Whether a record says that its instance is ready.
 pub(super) fn is_ready(record: &Record) -> bool {
-    record
-        .get("state")
-        .is_some_and(|state| state == ServiceState::Ready.as_str())
+    record.get("state").is_some_and(|state| state == ServiceState::Ready.as_str())
 }
 
 /// What was heard of the instances of those that are waited for.
@@ -28,10 +26,7 @@ pub(super) struct Roll {
 
 impl Roll {
     pub(super) fn new(services: &[ServiceName]) -> Self {
-        Self {
-            services: services.iter().cloned().collect(),
-            instances: BTreeMap::new(),
-        }
+        Self { services: services.iter().cloned().collect(), instances: BTreeMap::new() }
     }
 
     /// Takes a message in.
@@ -57,11 +52,7 @@ impl Roll {
             let mut all = self.instances.iter().filter(|((name, ..), _)| name == service.as_str());
             all.any(|(_, (_, until))| until.is_some_and(|until| until > now))
         };
-        self.services
-            .iter()
-            .filter(|service| !is_there(service))
-            .cloned()
-            .collect()
+        self.services.iter().filter(|service| !is_there(service)).cloned().collect()
     }
 }
 
@@ -84,7 +75,8 @@ mod tests {
 
     #[test]
     fn all_are_there_when_each_is_ready_at_the_same_time() {
-        let (flow, config): (ServiceName, ServiceName) = ("flow".parse().unwrap(), "config".parse().unwrap());
+        let (flow, config): (ServiceName, ServiceName) =
+            ("flow".parse().unwrap(), "config".parse().unwrap());
         let mut roll = Roll::new(&[flow.clone(), config.clone()]);
         let now = Instant::now();
         roll.hear(heard("flow", 1, true), now);

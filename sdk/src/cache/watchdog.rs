@@ -28,7 +28,10 @@ pub(super) async fn run(shared: &Shared) {
     }
     let end = match (&shared.store, &shared.key) {
         (_, None) => {
-            tracing::warn!(service = %shared.identity.service, "a service without a node cannot say that it lives");
+            tracing::warn!(
+                service = %shared.identity.service,
+                "a service without a node cannot say that it lives",
+            );
             Liveness::Off
         }
         (Some(store), Some(key)) => in_store(shared, store.as_ref(), key).await,
@@ -38,12 +41,16 @@ pub(super) async fn run(shared: &Shared) {
         }),
     };
     if end == Liveness::Superseded {
-        tracing::warn!(service = %shared.identity.service, "a newer process of the same service, node and instance lives");
+        tracing::warn!(
+            service = %shared.identity.service,
+            "a newer process of the same service, node and instance lives",
+        );
     }
     shared.liveness.send_replace(end);
 }
 
-/// Writes a record again and again. A look before each write finds out whether a newer process has the key.
+/// Writes a record again and again. A look before each write finds out whether a newer process has
+/// the key.
 async fn in_store(shared: &Shared, store: &dyn Store, key: &str) -> Liveness {
     // Until it has said something itself, what began in the future began before a clock went back.
     let mut is_first = shared.watchdog.by_clock;
@@ -94,9 +101,7 @@ async fn beat(
         let own = shared.epoch.load(Ordering::Relaxed);
         store.delete_record(key, &own.to_string()).await?;
     } else {
-        store
-            .put_record(key, shared.sign(said).record(), shared.watchdog.ttl)
-            .await?;
+        store.put_record(key, shared.sign(said).record(), shared.watchdog.ttl).await?;
     }
     Ok(true)
 }
@@ -117,12 +122,8 @@ async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
         }
         let was_taken = outcome == blaze_brokers::PublishOutcome::Taken;
         shared.show(if was_taken { Liveness::Alive } else { Liveness::Silent });
-        let next = Instant::now()
-            + if was_taken {
-                shared.pace()
-            } else {
-                shared.pace().min(RETRY)
-            };
+        let next =
+            Instant::now() + if was_taken { shared.pace() } else { shared.pace().min(RETRY) };
         loop {
             tokio::select! {
                 () = tokio::time::sleep_until(next) => break,
@@ -147,8 +148,7 @@ impl Shared {
     }
 
     fn show(&self, liveness: Liveness) {
-        self.liveness
-            .send_if_modified(|shown| std::mem::replace(shown, liveness) != liveness);
+        self.liveness.send_if_modified(|shown| std::mem::replace(shown, liveness) != liveness);
     }
 
     fn sign(&self, said: &Said) -> Sign<'_> {
@@ -163,7 +163,8 @@ impl Shared {
     }
 }
 
-/// Waits until each service has an instance that is ready. Never returns otherwise; `missing` has those that are not.
+/// Waits until each service has an instance that is ready. Never returns otherwise; `missing` has
+/// those that are not.
 pub(super) async fn wait(
     shared: &Shared,
     services: &[ServiceName],
@@ -189,13 +190,16 @@ fn signs_of(heard: &mut Vec<Received>) -> impl Iterator<Item = Heard> {
     payloads.filter_map(|payload| Heard::parse(&payload))
 }
 
-async fn wait_for_records(store: &dyn Store, services: &[ServiceName], missing: &Mutex<Vec<ServiceName>>) {
+async fn wait_for_records(
+    store: &dyn Store,
+    services: &[ServiceName],
+    missing: &Mutex<Vec<ServiceName>>,
+) {
     loop {
         let mut absent = Vec::new();
         for service in services {
-            let records = store
-                .records(&record::beginning(service.as_str()), super::MAX_INSTANCES)
-                .await;
+            let records =
+                store.records(&record::beginning(service.as_str()), super::MAX_INSTANCES).await;
             let is_there = match records {
                 Ok(records) => records.iter().any(|(_, record)| super::wait::is_ready(record)),
                 Err(error) => {

@@ -22,8 +22,9 @@ pub enum BaseSource {
     Worker(ConfigSource),
 }
 
-/// The configuration of a service that starts with a mounted file: usable before there is a broker, and brought up to date by
-/// the worker as soon as that answers. What the worker says is merged over the file (RFC 7396).
+/// The configuration of a service that starts with a mounted file: usable before there is a broker,
+/// and brought up to date by the worker as soon as that answers. What the worker says is merged
+/// over the file (RFC 7396).
 #[derive(Clone)]
 pub struct BaseConfiguration {
     file: Arc<Value>,
@@ -31,30 +32,24 @@ pub struct BaseConfiguration {
 }
 
 impl BaseConfiguration {
-    /// Reads a file of at most 1 MiB: JSON if its name ends with `.json`, else YAML. An empty one is an empty object.
+    /// Reads a file of at most 1 MiB: JSON if its name ends with `.json`, else YAML. An empty one
+    /// is an empty object.
     ///
     /// # Errors
     /// [`ConfigError::File`]: it is not there, cannot be read, or holds no single object.
     pub fn read(file: impl AsRef<Path>) -> Result<Self, ConfigError> {
         let path = file.as_ref();
-        let fault = |reason: String| ConfigError::File {
-            file: path.display().to_string(),
-            reason,
-        };
+        let fault = |reason: String| ConfigError::File { file: path.display().to_string(), reason };
         let bytes = read_small(path).map_err(|error| fault(error.to_string()))?;
         let bytes = bytes.ok_or_else(|| fault("is not there".to_owned()))?;
-        let is_json = path
-            .extension()
-            .is_some_and(|extension| extension.eq_ignore_ascii_case("json"));
+        let is_json =
+            path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json"));
         let value = if is_json { of_json(&bytes) } else { of_yaml(&bytes) };
         let value = value.map_err(fault)?;
         if !value.is_object() {
             return Err(fault("must hold an object".to_owned()));
         }
-        Ok(Self {
-            file: Arc::new(value),
-            worker: None,
-        })
+        Ok(Self { file: Arc::new(value), worker: None })
     }
 
     /// The same, with what the worker says over it from now on.
@@ -93,9 +88,7 @@ impl BaseConfiguration {
 /// Without the values, for they may be secrets.
 impl fmt::Debug for BaseConfiguration {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("BaseConfiguration")
-            .field("source", &self.source())
-            .finish_non_exhaustive()
+        f.debug_struct("BaseConfiguration").field("source", &self.source()).finish_non_exhaustive()
     }
 }
 
@@ -106,10 +99,9 @@ fn of_json(bytes: &[u8]) -> Result<Value, String> {
 fn of_yaml(bytes: &[u8]) -> Result<Value, String> {
     let text = std::str::from_utf8(bytes).map_err(|_| "is no UTF-8".to_owned())?;
     match yaml_documents(text, 1) {
-        Ok(documents) => Ok(documents
-            .into_iter()
-            .next()
-            .unwrap_or_else(|| Value::Object(Map::new()))),
+        Ok(documents) => {
+            Ok(documents.into_iter().next().unwrap_or_else(|| Value::Object(Map::new())))
+        }
         Err(faults) => {
             let first = faults.first().map(|fault| format!("{}: {}", fault.place, fault.detail));
             Err(first.unwrap_or_else(|| "is no YAML".to_owned()))

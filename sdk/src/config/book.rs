@@ -73,10 +73,12 @@ pub struct ConfigCounts {
 /// The configuration of one service.
 pub(super) struct ConfigBook {
     identity: Identity,
-    /// Where the service runs as far as its broker tells; `None`: not known, and on the broker of a layer nowhere in particular.
+    /// Where the service runs as far as its broker tells; `None`: not known, and on the broker of a
+    /// layer nowhere in particular.
     node: Option<String>,
     scope: Scope,
-    /// Begins all identities of requests, so that they differ from those of other services on a shared reply topic.
+    /// Begins all identities of requests, so that they differ from those of other services on a
+    /// shared reply topic.
     id_prefix: String,
     reply_to: String,
     standing: Standing,
@@ -86,7 +88,13 @@ pub(super) struct ConfigBook {
 }
 
 impl ConfigBook {
-    pub(super) fn new(identity: Identity, scope: Scope, life: u64, reply_to: String, now: Instant) -> Self {
+    pub(super) fn new(
+        identity: Identity,
+        scope: Scope,
+        life: u64,
+        reply_to: String,
+        now: Instant,
+    ) -> Self {
         Self {
             node: identity.node.as_ref().map(ToString::to_string),
             identity,
@@ -150,7 +158,8 @@ impl ConfigBook {
                 let Standing::Held(held) = &mut self.standing else {
                     return None;
                 };
-                // The hash may be that of an earlier request; then the answer says nothing of what there is now.
+                // The hash may be that of an earlier request; then the answer says nothing of what
+                // there is now.
                 if held.hash == hash && revision >= held.revision {
                     held.revision = revision;
                     held.source = source;
@@ -202,12 +211,17 @@ impl ConfigBook {
     }
 
     /// Takes a configuration, unless it is an older one.
-    fn take(&mut self, new: Held, told: Option<(Vec<String>, Vec<ConfigScope>)>, now: Instant) -> Option<ConfigChange> {
+    fn take(
+        &mut self,
+        new: Held,
+        told: Option<(Vec<String>, Vec<ConfigScope>)>,
+        now: Instant,
+    ) -> Option<ConfigChange> {
         let is_older = match &self.standing {
             Standing::Nothing => false,
             Standing::Held(old) => new.revision < old.revision,
-            // At the revision that deleted it, a configuration is one of before. All that a mounted file says is of revision 0, and comes
-            // in its order.
+            // At the revision that deleted it, a configuration is one of before. All that a mounted
+            // file says is of revision 0, and comes in its order.
             Standing::Deleted { revision: 0 } => false,
             Standing::Deleted { revision } => new.revision <= *revision,
         };
@@ -223,8 +237,9 @@ impl ConfigBook {
             return None;
         }
         if old.as_ref().is_some_and(|old| old.revision == new.revision) {
-            // A node that drops a roll-out by itself makes another configuration of the same revision. Which of two is the
-            // later one, their order does not tell for sure; the worker does.
+            // A node that drops a roll-out by itself makes another configuration of the same
+            // revision. Which of two is the later one, their order does not tell for sure; the
+            // worker does.
             self.next = self.next.min(now + RETRY);
         }
         let old = old.map(|old| old.config);

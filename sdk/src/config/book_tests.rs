@@ -9,15 +9,9 @@ use crate::service::slam;
 const LIFE: u64 = 0x7f;
 
 fn book(node: Option<&str>, scope: Scope) -> (ConfigBook, Instant) {
-    let identity = Identity {
-        node: node.map(|node| node.parse().unwrap()),
-        ..slam()
-    };
+    let identity = Identity { node: node.map(|node| node.parse().unwrap()), ..slam() };
     let now = Instant::now();
-    (
-        ConfigBook::new(identity, scope, LIFE, "blaze/reply/slam".to_owned(), now),
-        now,
-    )
+    (ConfigBook::new(identity, scope, LIFE, "blaze/reply/slam".to_owned(), now), now)
 }
 
 fn ours() -> (ConfigBook, Instant) {
@@ -26,19 +20,22 @@ fn ours() -> (ConfigBook, Instant) {
 
 fn given(revision: u64, config: &Value) -> Vec<u8> {
     let id = format!("{LIFE:016x}-1");
-    json!({"id": id, "service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": revision,
+    json!({"id": id, "service": "slam", "instance": "0", "layer": "edge", "node": "robot-1",
+        "revision": revision,
         "hash": hash(config), "config": config, "source": "main"})
     .to_string()
     .into_bytes()
 }
 
 fn notice(revision: u64, config: &Value) -> Value {
-    json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": revision, "hash": hash(config),
+    json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1",
+        "revision": revision, "hash": hash(config),
         "paths": ["/rate"], "scopes": ["node"], "config": config, "source": "main"})
 }
 
 fn deleted(revision: u64) -> Value {
-    json!({"service": "slam", "instance": "0", "node": "robot-1", "revision": revision, "hash": null, "paths": [],
+    json!({"service": "slam", "instance": "0", "node": "robot-1", "revision": revision,
+        "hash": null, "paths": [],
         "scopes": [], "config": null, "deleted": true, "source": "main"})
 }
 
@@ -56,7 +53,13 @@ fn it_asks_until_there_is_an_answer_and_then_every_minute_with_the_hash() {
     let first: Value = serde_json::from_str(&book.poll(start).unwrap()).unwrap();
     assert_eq!(
         first,
-        json!({"service": "slam", "instance": "0", "node": "robot-1", "id": "000000000000007f-1", "reply_to": "blaze/reply/slam"})
+        json!({
+            "service": "slam",
+            "instance": "0",
+            "node": "robot-1",
+            "id": "000000000000007f-1",
+            "reply_to": "blaze/reply/slam",
+        })
     );
     assert_eq!(book.poll(start + RETRY / 2), None);
     assert!(book.poll(start + RETRY).is_some());
@@ -89,13 +92,9 @@ fn a_refusal_is_kept_and_says_when_to_ask_again() {
 #[test]
 fn a_change_that_was_found_by_asking_says_what_is_different_and_may_be_of_any_scope() {
     let (mut book, now) = ours();
-    let first = book
-        .on_reply(&given(1, &json!({"rate": 10, "a": {"b": 1}})), now)
-        .unwrap();
+    let first = book.on_reply(&given(1, &json!({"rate": 10, "a": {"b": 1}})), now).unwrap();
     assert_eq!((first.old, first.deleted), (None, false));
-    let second = book
-        .on_reply(&given(2, &json!({"rate": 20, "a": {"b": 1}})), now)
-        .unwrap();
+    let second = book.on_reply(&given(2, &json!({"rate": 20, "a": {"b": 1}})), now).unwrap();
     assert_eq!(second.paths, ["/rate"]);
     assert!(second.scopes.is_empty() && second.is_of(ConfigScope::Layer));
     assert_eq!(book.on_reply(&given(3, &json!({"rate": 20, "a": {"b": 1}})), now), None);
@@ -125,7 +124,9 @@ fn a_service_without_a_node_hears_what_the_scope_of_its_broker_allows() {
     let of_robot = notice(2, &json!({"rate": 20}));
     let mut of_nowhere = of_robot.clone();
     of_nowhere["node"] = Value::Null;
-    for (scope, hears_robot, hears_nowhere) in [(Scope::Node, true, true), (Scope::Layer, false, true)] {
+    for (scope, hears_robot, hears_nowhere) in
+        [(Scope::Node, true, true), (Scope::Layer, false, true)]
+    {
         for (notice, hears) in [(&of_robot, hears_robot), (&of_nowhere, hears_nowhere)] {
             let (mut book, now) = book(None, scope);
             assert_eq!(book.on_notice(&bytes(notice), now).is_some(), hears, "{scope:?}");
@@ -162,7 +163,15 @@ fn another_configuration_of_the_same_revision_is_taken_and_asked_about() {
 fn an_unchanged_that_answers_an_earlier_request_moves_nothing() {
     let (mut book, now) = ours();
     book.on_reply(&given(5, &json!({"rate": 1})), now);
-    let unchanged = |revision: u64, hash: &str| json!({"id": "000000000000007f-1", "unchanged": true, "revision": revision, "hash": hash, "source": "copy"});
+    let unchanged = |revision: u64, hash: &str| {
+        json!({
+            "id": "000000000000007f-1",
+            "unchanged": true,
+            "revision": revision,
+            "hash": hash,
+            "source": "copy",
+        })
+    };
     book.on_reply(&bytes(&unchanged(9, "sha256:other")), now);
     book.on_reply(&bytes(&unchanged(4, &hash(&json!({"rate": 1})))), now);
     assert_eq!(book.standing().revision(), Some(5));
@@ -176,8 +185,8 @@ fn histories() -> impl Strategy<Value = Vec<Option<u8>>> {
 }
 
 proptest! {
-    /// Each step delivers one of the revisions again, as a notice or as an answer, in whatever order; the newest one is among
-    /// them.
+    /// Each step delivers one of the revisions again, as a notice or as an answer, in whatever
+    /// order; the newest one is among them.
     #[test]
     fn whatever_the_order_it_never_goes_back_and_ends_at_the_newest(
         history in histories(),
@@ -188,15 +197,22 @@ proptest! {
         let (mut book, now) = ours();
         let last = history.len() - 1;
         let at = newest_at.index(steps.len() + 1);
-        let mut sequence: Vec<(usize, bool)> = steps.drain(..).map(|(which, answer)| (which.index(history.len()), answer)).collect();
+        let mut sequence: Vec<(usize, bool)> =
+            steps.drain(..).map(|(which, answer)| (which.index(history.len()), answer)).collect();
         sequence.insert(at, (last, newest_is_answer));
         let mut before = None;
         let mut shown: Option<Value> = None;
         for (which, is_answer) in sequence {
             let revision = which as u64 + 1;
             let change = match history[which] {
-                Some(rate) if is_answer => book.on_reply(&given(revision, &json!({ "rate": rate })), now),
-                Some(rate) => book.on_notice(&bytes(&notice(revision, &json!({ "rate": rate }))), now),
+                Some(rate) if is_answer => book.on_reply(
+                    &given(revision, &json!({ "rate": rate })),
+                    now,
+                ),
+                Some(rate) => book.on_notice(
+                    &bytes(&notice(revision, &json!({ "rate": rate }))),
+                    now,
+                ),
                 // An answer does not tell of a deletion with a revision, so only notices do.
                 None => book.on_notice(&bytes(&deleted(revision)), now),
             };
@@ -221,10 +237,7 @@ fn what_a_mounted_file_takes_away_and_gives_again_is_there_again() {
     let (mut book, now) = ours();
     book.poll(now).unwrap();
     book.on_reply(&given(0, &json!({ "rate": 1 })), now);
-    assert!(
-        book.on_notice(&bytes(&deleted(0)), now)
-            .is_some_and(|change| change.deleted)
-    );
+    assert!(book.on_notice(&bytes(&deleted(0)), now).is_some_and(|change| change.deleted));
     let again = book.on_notice(&bytes(&notice(0, &json!({ "rate": 2 }))), now).unwrap();
     assert_eq!(
         (again.new.as_deref(), again.hash),

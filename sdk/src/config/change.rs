@@ -39,8 +39,8 @@ pub struct ConfigChange {
     pub hash: Option<String>,
     /// JSON pointers of what is different, sorted; empty if the service was deleted.
     pub paths: Vec<String>,
-    /// Which kinds of document changed. Empty = unknown: it is the first configuration, the notice was missed and the change
-    /// was found by asking, or the service was deleted.
+    /// Which kinds of document changed. Empty = unknown: it is the first configuration, the notice
+    /// was missed and the change was found by asking, or the service was deleted.
     pub scopes: Vec<ConfigScope>,
     /// The service was deleted.
     pub deleted: bool,
@@ -66,12 +66,7 @@ impl ConfigChange {
         };
         scopes.sort();
         scopes.dedup();
-        Self {
-            old: self.old,
-            paths: if next.deleted { Vec::new() } else { paths },
-            scopes,
-            ..next
-        }
+        Self { old: self.old, paths: if next.deleted { Vec::new() } else { paths }, scopes, ..next }
     }
 }
 
@@ -93,7 +88,11 @@ pub(super) mod tests {
 
     use super::*;
 
-    pub(in crate::config) fn change(revision: u64, scopes: &[ConfigScope], paths: &[&str]) -> ConfigChange {
+    pub(in crate::config) fn change(
+        revision: u64,
+        scopes: &[ConfigScope],
+        paths: &[&str],
+    ) -> ConfigChange {
         ConfigChange {
             old: Some(Arc::new(json!({ "n": revision - 1 }))),
             new: Some(Arc::new(json!({ "n": revision, "password": "geheim" }))),
@@ -108,9 +107,7 @@ pub(super) mod tests {
     #[test]
     fn two_changes_are_one_from_the_first_to_the_last() {
         let first = change(2, &[ConfigScope::Service], &["/n", "/b"]);
-        let both = first
-            .clone()
-            .followed_by(change(3, &[ConfigScope::Node], &["/a", "/n"]));
+        let both = first.clone().followed_by(change(3, &[ConfigScope::Node], &["/a", "/n"]));
         assert_eq!(both.old, first.old);
         assert_eq!(both.new.as_ref().map(|new| new["n"].clone()), Some(json!(3)));
         assert_eq!(both.paths, ["/a", "/b", "/n"]);

@@ -21,9 +21,11 @@ pub(super) async fn run(shared: &Shared, own_reply: ChannelName) {
 
 async fn drive(shared: &Shared, own_reply: ChannelName) -> Result<(), BrokerError> {
     let broker = shared.broker.as_ref();
-    // Both are heard before the first request is sent, so that nothing falls between an answer and the notices after it.
+    // Both are heard before the first request is sent, so that nothing falls between an answer and
+    // the notices after it.
     let mut replies = subscribe(broker, &reply_channel(broker.kind(), own_reply)).await?;
-    let mut notices = subscribe(broker, &channel(&format!("{CHANGED}/{}", shared.identity.service))?).await?;
+    let mut notices =
+        subscribe(broker, &channel(&format!("{CHANGED}/{}", shared.identity.service))?).await?;
     let requests = broker.publisher(&channel(GET)?, speaking(broker.kind()))?;
     let mut status = broker.status();
     let mut was_up = status.borrow_and_update().health == Health::Up;
@@ -80,9 +82,8 @@ impl Shared {
             let (change, standing, refusal) = {
                 let mut book = self.book.lock();
                 let change = on(&mut book, &payload);
-                let refusal = book
-                    .refusal()
-                    .map(|refusal| format!("{}: {}", refusal.code, refusal.detail));
+                let refusal =
+                    book.refusal().map(|refusal| format!("{}: {}", refusal.code, refusal.detail));
                 (change, book.standing().clone(), refusal)
             };
             self.shown.send_if_modified(|shown| {

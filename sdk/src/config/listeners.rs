@@ -1,7 +1,8 @@
 //! Callbacks for changes, each with a queue of its own on the service's pool.
 //!
-//! A listener has at most one ticket in the pool, so its callbacks come one at a time and in order. A full queue makes one
-//! change of its last two: a slow callback sees fewer steps, and always the last state.
+//! A listener has at most one ticket in the pool, so its callbacks come one at a time and in order.
+//! A full queue makes one change of its last two: a slow callback sees fewer steps, and always the
+//! last state.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -70,10 +71,7 @@ impl Drop for ConfigListener {
 
 impl Listeners {
     pub(super) fn new(pool: PoolHandle) -> Self {
-        Self {
-            pool,
-            all: Mutex::default(),
-        }
+        Self { pool, all: Mutex::default() }
     }
 
     pub(super) fn add(&self, scopes: &[ConfigScope], callback: Callback) -> ConfigListener {
@@ -160,7 +158,9 @@ mod tests {
         let gate = Arc::new(Mutex::new(()));
         let seen: Arc<Mutex<Vec<(u64, u64)>>> = Arc::default();
         let (passes, notes) = (Arc::clone(&gate), Arc::clone(&seen));
-        let number = |config: &Option<Arc<serde_json::Value>>| config.as_ref().unwrap()["n"].as_u64().unwrap();
+        let number = |config: &Option<Arc<serde_json::Value>>| {
+            config.as_ref().unwrap()["n"].as_u64().unwrap()
+        };
         let listener = listeners.add(
             &[],
             Box::new(move |change| {
@@ -178,10 +178,7 @@ mod tests {
         let seen = seen.lock();
         assert!(seen.len() <= MAX_WAITING + 1 && listener.merged() >= all - 1 - MAX_WAITING as u64);
         assert_eq!(seen[0].0, 0);
-        assert!(
-            seen.windows(2).all(|pair| pair[0].1 == pair[1].0),
-            "no step is missing: {seen:?}"
-        );
+        assert!(seen.windows(2).all(|pair| pair[0].1 == pair[1].0), "no step is missing: {seen:?}");
     }
 
     #[tokio::test]

@@ -123,8 +123,8 @@ struct Shared {
     wanted: Notify,
 }
 
-/// The service's configuration: what it is now, and callbacks when it changes. Asking begins with the first call of
-/// [`ServiceManager::config`](crate::ServiceManager::config).
+/// The service's configuration: what it is now, and callbacks when it changes. Asking begins with
+/// the first call of [`ServiceManager::config`](crate::ServiceManager::config).
 #[derive(Clone)]
 pub struct ConfigManager {
     shared: Arc<Shared>,
@@ -140,7 +140,8 @@ impl ConfigManager {
     ) -> Self {
         let life = rand::random::<u64>();
         let reply = ChannelName::reply(&identity.service, &identity.instance, life);
-        let book = ConfigBook::new(identity.clone(), scope, life, reply.to_string(), reserved::now());
+        let book =
+            ConfigBook::new(identity.clone(), scope, life, reply.to_string(), reserved::now());
         let shared = Arc::new(Shared {
             identity,
             broker,
@@ -177,7 +178,8 @@ impl ConfigManager {
     /// Waits until a worker has given a configuration, for so long.
     ///
     /// # Errors
-    /// [`ConfigError::NotReady`] with the worker's words, [`ConfigError::Deleted`], [`ConfigError::Closed`].
+    /// [`ConfigError::NotReady`] with the worker's words, [`ConfigError::Deleted`],
+    /// [`ConfigError::Closed`].
     pub async fn ready(&self, timeout: Duration) -> Result<(), ConfigError> {
         let mut shown = self.shared.shown.subscribe();
         let is_there = shown.wait_for(|shown| shown.held().is_some() || shown.closed);
@@ -234,35 +236,51 @@ impl ConfigManager {
         self.shared.shown.borrow().held().map(read)
     }
 
-    /// Calls back for each change from now on, also for the first configuration if it comes later than this call, on the
-    /// service's pool, in order, one at a time. A callback that is more than 16 changes behind gets its last two as one. Whoever
-    /// must not miss the first one looks at [`ConfigManager::value`] once afterwards.
-    pub fn on_change(&self, callback: impl Fn(&ConfigChange) + Send + Sync + 'static) -> ConfigListener {
+    /// Calls back for each change from now on, also for the first configuration if it comes later
+    /// than this call, on the service's pool, in order, one at a time. A callback that is more than
+    /// 16 changes behind gets its last two as one. Whoever must not miss the first one looks at
+    /// [`ConfigManager::value`] once afterwards.
+    pub fn on_change(
+        &self,
+        callback: impl Fn(&ConfigChange) + Send + Sync + 'static,
+    ) -> ConfigListener {
         self.shared.listeners.add(&[], Box::new(callback))
     }
 
-    /// As [`ConfigManager::on_change`], when the layer's document changed, or may have ([`ConfigChange::scopes`]).
-    pub fn on_layer_change(&self, callback: impl Fn(&ConfigChange) + Send + Sync + 'static) -> ConfigListener {
+    /// As [`ConfigManager::on_change`], when the layer's document changed, or may have
+    /// ([`ConfigChange::scopes`]).
+    pub fn on_layer_change(
+        &self,
+        callback: impl Fn(&ConfigChange) + Send + Sync + 'static,
+    ) -> ConfigListener {
         self.shared.listeners.add(&[ConfigScope::Layer], Box::new(callback))
     }
 
     /// As [`ConfigManager::on_change`], when the node's document changed, or may have.
-    pub fn on_node_change(&self, callback: impl Fn(&ConfigChange) + Send + Sync + 'static) -> ConfigListener {
+    pub fn on_node_change(
+        &self,
+        callback: impl Fn(&ConfigChange) + Send + Sync + 'static,
+    ) -> ConfigListener {
         self.shared.listeners.add(&[ConfigScope::Node], Box::new(callback))
     }
 
-    /// As [`ConfigManager::on_change`], when the document of the service or of its instance changed, or may have.
-    pub fn on_service_change(&self, callback: impl Fn(&ConfigChange) + Send + Sync + 'static) -> ConfigListener {
+    /// As [`ConfigManager::on_change`], when the document of the service or of its instance
+    /// changed, or may have.
+    pub fn on_service_change(
+        &self,
+        callback: impl Fn(&ConfigChange) + Send + Sync + 'static,
+    ) -> ConfigListener {
         let scopes = [ConfigScope::Service, ConfigScope::Instance];
         self.shared.listeners.add(&scopes, Box::new(callback))
     }
 
-    /// Tells workers how the service gets on with the configuration that it has now. A staged roll-out is undone by `rejected` and
-    /// `unhealthy`. Of the detail, 4 KiB are sent. In a callback, while which the next configuration may come, use
-    /// [`ConfigManager::ack_change`].
+    /// Tells workers how the service gets on with the configuration that it has now. A staged
+    /// roll-out is undone by `rejected` and `unhealthy`. Of the detail, 4 KiB are sent. In a
+    /// callback, while which the next configuration may come, use [`ConfigManager::ack_change`].
     ///
     /// # Errors
-    /// [`SdkError::Broker`], when the broker cannot carry it at all. One that is away drops it, which is an outcome.
+    /// [`SdkError::Broker`], when the broker cannot carry it at all. One that is away drops it,
+    /// which is an outcome.
     pub fn ack(&self, status: AckStatus, detail: &str) -> Result<PublishOutcome, SdkError> {
         let held = self.held(|held| (held.revision, held.hash.clone()));
         self.ack_of(

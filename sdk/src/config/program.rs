@@ -22,7 +22,8 @@ use super::{AckStatus, ConfigManager, Shown};
 const ORIGIN: &str = "BlazeConfig";
 /// An acknowledgement that the broker did not take is tried again after this time.
 const RETRY: Duration = Duration::from_secs(1);
-/// A rejection is said again after this time: it may have been missed, and a roll-out is judged by it.
+/// A rejection is said again after this time: it may have been missed, and a roll-out is judged by
+/// it.
 const AGAIN: Duration = Duration::from_secs(5);
 /// Faults that an acknowledgement names, at most.
 const MAX_FAULTS: usize = 5;
@@ -53,20 +54,23 @@ impl ProgramConfig {
         supervisor.spawn("program configuration", TaskPolicy::MayEnd, async move {
             tokio::select! {
                 () = stop.cancelled() => {}
-                ((), ()) = async { tokio::join!(lay_over(shown, tell), acknowledge(&speaker, saying)) } => {}
+                ((), ()) =
+                    async { tokio::join!(lay_over(shown, tell), acknowledge(&speaker, saying)) } => {}
             }
         });
         Self { overlays, said }
     }
 
-    /// The sections of the node file that a worker gives, for [`blaze_runtime::config::watch_with`]; other members are left
-    /// out. `None`: no worker gave any yet, or the service was deleted.
+    /// The sections of the node file that a worker gives, for
+    /// [`blaze_runtime::config::watch_with`]; other members are left out. `None`: no worker gave
+    /// any yet, or the service was deleted.
     #[must_use]
     pub fn overlays(&self) -> watch::Receiver<Option<Overlay>> {
         self.overlays.clone()
     }
 
-    /// Acknowledges what became of a configuration: `applied`, with what is to be said besides, or `rejected` with its faults.
+    /// Acknowledges what became of a configuration: `applied`, with what is to be said besides, or
+    /// `rejected` with its faults.
     pub fn judged(&self, verdict: Option<&Verdict>, besides: &str) {
         self.said.send_replace(verdict.map(|verdict| said(verdict, besides)));
     }
@@ -76,7 +80,8 @@ fn said(verdict: &Verdict, besides: &str) -> Said {
     let (status, detail) = match &verdict.faults {
         None => (AckStatus::Applied, besides.to_owned()),
         Some(faults) => {
-            let lines: Vec<String> = faults.iter().take(MAX_FAULTS).map(ToString::to_string).collect();
+            let lines: Vec<String> =
+                faults.iter().take(MAX_FAULTS).map(ToString::to_string).collect();
             (AckStatus::Rejected, lines.join("; "))
         }
     };
@@ -94,7 +99,9 @@ async fn lay_over(mut shown: watch::Receiver<Shown>, tell: watch::Sender<Option<
         let overlay = overlay(&shown.borrow_and_update());
         tell.send_if_modified(|before| {
             // The revision goes on with the store, also where nothing changes here.
-            let hash = |overlay: &Option<Overlay>| overlay.as_ref().map(|overlay| Arc::clone(&overlay.hash));
+            let hash = |overlay: &Option<Overlay>| {
+                overlay.as_ref().map(|overlay| Arc::clone(&overlay.hash))
+            };
             let is_other = hash(before) != hash(&overlay);
             if is_other {
                 *before = overlay;
@@ -111,7 +118,8 @@ fn overlay(shown: &Shown) -> Option<Overlay> {
     let held = shown.held()?;
     let members = held.config.as_object().into_iter().flatten();
     let sections = members.filter(|(name, _)| NODE_FILE_SECTIONS.contains(&name.as_str()));
-    let tree: Map<String, Value> = sections.map(|(name, value)| (name.clone(), value.clone())).collect();
+    let tree: Map<String, Value> =
+        sections.map(|(name, value)| (name.clone(), value.clone())).collect();
     Some(Overlay {
         origin: Arc::from(ORIGIN),
         revision: held.revision,
@@ -125,15 +133,17 @@ async fn acknowledge(config: &ConfigManager, mut saying: watch::Receiver<Option<
     loop {
         let said = saying.borrow_and_update().clone();
         let again = match &said {
-            Some(said) => match config.ack_of(Some((said.revision, &said.hash)), said.status, &said.detail) {
-                Ok(PublishOutcome::Taken) if said.status == AckStatus::Rejected => Some(AGAIN),
-                Ok(PublishOutcome::Taken) => None,
-                Ok(_) => Some(RETRY),
-                Err(error) => {
-                    tracing::debug!(%error, "a configuration could not be acknowledged");
-                    None
+            Some(said) => {
+                match config.ack_of(Some((said.revision, &said.hash)), said.status, &said.detail) {
+                    Ok(PublishOutcome::Taken) if said.status == AckStatus::Rejected => Some(AGAIN),
+                    Ok(PublishOutcome::Taken) => None,
+                    Ok(_) => Some(RETRY),
+                    Err(error) => {
+                        tracing::debug!(%error, "a configuration could not be acknowledged");
+                        None
+                    }
                 }
-            },
+            }
             None => None,
         };
         let wait = async {

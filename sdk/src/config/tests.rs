@@ -1,12 +1,12 @@
-//! The configuration of a service against a worker that answers as the contract says, on a clock that stands still until all
-//! wait.
+//! The configuration of a service against a worker that answers as the contract says, on a clock
+//! that stands still until all wait.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use crate::{
-    AckStatus, BaseConfiguration, BaseSource, CacheError, ConfigChange, ConfigError, ConfigScope, ConfigSource,
-    SdkError, ServiceManager, ServiceOptions, ServiceState,
+    AckStatus, BaseConfiguration, BaseSource, CacheError, ConfigChange, ConfigError, ConfigScope,
+    ConfigSource, SdkError, ServiceManager, ServiceOptions, ServiceState,
 };
 use blaze_brokers::memory::{MemoryBroker, MemoryHub};
 use blaze_brokers::{Broker as _, Content, PublisherOptions, SubscribeOptions, Subscription};
@@ -54,15 +54,19 @@ impl PlayedWorker {
     }
 
     pub(super) fn give(&self, request: &Value, revision: u64, config: &Value) {
-        let rest = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": revision,
-            "hash": hash(config), "config": config, "source": "main", "as_of": "2026-11-21T07:01:12.345Z", "age_s": 0.1,
+        let rest = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1",
+            "revision": revision,
+            "hash": hash(config), "config": config, "source": "main",
+            "as_of": "2026-11-21T07:01:12.345Z", "age_s": 0.1,
             "rollout": null});
         self.answer(request, rest);
     }
 
     pub(super) fn tell(&self, revision: u64, config: &Value, scope: &str) {
-        let notice = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": revision,
-            "hash": hash(config), "previous_hash": null, "paths": ["/rate_hz"], "scopes": [scope], "config": config,
+        let notice = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1",
+            "revision": revision,
+            "hash": hash(config), "previous_hash": null, "paths": ["/rate_hz"], "scopes": [scope],
+            "config": config,
             "source": "main", "time": "2026-11-21T07:01:12.345Z"});
         self.say("blaze/config/changed/slam", &notice);
     }
@@ -89,7 +93,8 @@ fn hash(config: &Value) -> String {
 
 fn options(hub: &MemoryHub, name: &str) -> ServiceOptions {
     let broker = Arc::new(hub.broker());
-    let options = ServiceOptions::new("edge".parse().unwrap(), name.parse().unwrap(), broker, Scope::Node);
+    let options =
+        ServiceOptions::new("edge".parse().unwrap(), name.parse().unwrap(), broker, Scope::Node);
     options.on_node("robot-1".parse().unwrap())
 }
 
@@ -134,10 +139,7 @@ async fn it_asks_each_second_until_there_is_an_answer_and_each_minute_with_the_h
     worker.give(&again, 431, &json!({"rate_hz": 10}));
     config.ready(LONG).await.unwrap();
     assert_eq!(config.typed::<Settings>(), Ok(Settings { rate_hz: 10 }));
-    assert_eq!(
-        (config.revision(), config.source()),
-        (Some(431), Some(ConfigSource::Main))
-    );
+    assert_eq!((config.revision(), config.source()), (Some(431), Some(ConfigSource::Main)));
     let (third, with_hash) = worker.asked().await;
     assert_eq!(third - second, PERIOD);
     assert_eq!(with_hash["hash"], hash(&json!({"rate_hz": 10})).as_str());
@@ -171,10 +173,7 @@ async fn callbacks_hear_of_their_scopes_in_order_and_never_of_what_is_older() {
     assert_eq!((first.old, first.revision, first.scopes.len()), (None, 5, 0));
     // It may come from anywhere.
     assert_eq!(
-        (
-            change(&mut hears_node).await.revision,
-            change(&mut hears_service).await.revision
-        ),
+        (change(&mut hears_node).await.revision, change(&mut hears_service).await.revision),
         (5, 5)
     );
     worker.tell(6, &json!({"rate_hz": 20}), "node");
@@ -187,7 +186,8 @@ async fn callbacks_hear_of_their_scopes_in_order_and_never_of_what_is_older() {
     assert_eq!(third.old, second.new);
     assert_eq!(change(&mut hears_node).await.revision, 6);
     assert_eq!(change(&mut hears_service).await.revision, 7);
-    let gone = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": 8, "hash": null,
+    let gone = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1",
+        "revision": 8, "hash": null,
         "paths": [], "scopes": [], "config": null, "deleted": true, "source": "main"});
     worker.say("blaze/config/changed/slam", &gone);
     assert!(change(&mut hears_all).await.deleted);
@@ -253,10 +253,7 @@ async fn what_the_worker_says_lies_over_the_mounted_file() {
     let (_, request) = worker.asked().await;
     worker.give(&request, 5, &json!({"rate_hz": 10, "camera": {"width": 320}}));
     service.config().ready(LONG).await.unwrap();
-    assert_eq!(
-        base.value(),
-        json!({"rate_hz": 10, "camera": {"width": 320, "height": 480}})
-    );
+    assert_eq!(base.value(), json!({"rate_hz": 10, "camera": {"width": 320, "height": 480}}));
     assert_eq!(base.source(), BaseSource::Worker(ConfigSource::Main));
     service.shutdown().await;
 }

@@ -10,12 +10,12 @@ use super::ConfigError;
 /// # Errors
 /// [`ConfigError::Type`].
 pub(super) fn read<T: DeserializeOwned>(value: &Value) -> Result<T, ConfigError> {
-    T::deserialize(value).map_err(|error| ConfigError::Type {
-        reason: without_values(&error.to_string()),
-    })
+    T::deserialize(value)
+        .map_err(|error| ConfigError::Type { reason: without_values(&error.to_string()) })
 }
 
-/// What the library says quotes the value that does not fit, which may be a secret; what was expected quotes none.
+/// What the library says quotes the value that does not fit, which may be a secret; what was
+/// expected quotes none.
 fn without_values(text: &str) -> String {
     let names_a_member = ["missing field ", "unknown field ", "duplicate field "];
     if names_a_member.iter().any(|beginning| text.starts_with(beginning)) {

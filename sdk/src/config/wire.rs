@@ -24,15 +24,8 @@ pub(super) struct Refusal {
 /// What a worker answers.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Answer {
-    Given {
-        held: Held,
-        node: Option<String>,
-    },
-    Unchanged {
-        revision: u64,
-        hash: String,
-        source: ConfigSource,
-    },
+    Given { held: Held, node: Option<String> },
+    Unchanged { revision: u64, hash: String, source: ConfigSource },
     Refused(Refusal),
 }
 
@@ -49,7 +42,8 @@ pub(super) struct Notice {
     pub(super) scopes: Vec<ConfigScope>,
 }
 
-/// All members of answers and notices; which of them are there says what it is. Further ones are ignored.
+/// All members of answers and notices; which of them are there says what it is. Further ones are
+/// ignored.
 #[derive(Deserialize)]
 struct Members {
     id: Option<String>,
@@ -80,12 +74,11 @@ struct ErrorMembers {
 
 impl Members {
     fn read(payload: &[u8]) -> Option<Self> {
-        (payload.len() <= MAX_MESSAGE_BYTES)
-            .then(|| serde_json::from_slice(payload).ok())
-            .flatten()
+        (payload.len() <= MAX_MESSAGE_BYTES).then(|| serde_json::from_slice(payload).ok()).flatten()
     }
 
-    /// The source; one of a later version counts as the best, which changes nothing but what is shown.
+    /// The source; one of a later version counts as the best, which changes nothing but what is
+    /// shown.
     fn source(&self) -> ConfigSource {
         let word = self.source.as_deref().unwrap_or_default();
         word.parse().unwrap_or(ConfigSource::Main)
@@ -108,10 +101,7 @@ pub(super) fn answer(payload: &[u8], id_prefix: &str) -> Option<Answer> {
         return None;
     }
     if let Some(error) = members.error {
-        return Some(Answer::Refused(Refusal {
-            code: error.code,
-            detail: error.detail,
-        }));
+        return Some(Answer::Refused(Refusal { code: error.code, detail: error.detail }));
     }
     if members.unchanged {
         return Some(Answer::Unchanged {
@@ -121,10 +111,7 @@ pub(super) fn answer(payload: &[u8], id_prefix: &str) -> Option<Answer> {
         });
     }
     let held = members.held()?;
-    Some(Answer::Given {
-        held,
-        node: members.node,
-    })
+    Some(Answer::Given { held, node: members.node })
 }
 
 /// Reads a notice; `None` if it is none.
@@ -151,8 +138,14 @@ pub(super) fn request(identity: &Identity, id: &str, reply_to: &str, hash: Optio
     spoken(identity, members)
 }
 
-/// An acknowledgement of a revision and its hash. A detail that is too long is cut, and control characters become spaces: a worker reads neither.
-pub(super) fn ack(identity: &Identity, of: Option<(u64, &str)>, status: AckStatus, detail: &str) -> String {
+/// An acknowledgement of a revision and its hash. A detail that is too long is cut, and control
+/// characters become spaces: a worker reads neither.
+pub(super) fn ack(
+    identity: &Identity,
+    of: Option<(u64, &str)>,
+    status: AckStatus,
+    detail: &str,
+) -> String {
     let mut end = detail.len().min(MAX_DETAIL_BYTES);
     while !detail.is_char_boundary(end) {
         end -= 1;
@@ -192,8 +185,10 @@ mod tests {
 
     #[test]
     fn the_answers_of_the_contract_are_read() {
-        let given = json!({"id": "7f-1", "service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": 431,
-            "hash": "sha256:a", "config": {"a": 1}, "source": "copy", "as_of": "2026-11-21T07:01:12.345Z", "age_s": 3.1,
+        let given = json!({"id": "7f-1", "service": "slam", "instance": "0", "layer": "edge",
+            "node": "robot-1", "revision": 431,
+            "hash": "sha256:a", "config": {"a": 1}, "source": "copy",
+            "as_of": "2026-11-21T07:01:12.345Z", "age_s": 3.1,
             "rollout": null});
         let held = Held {
             revision: 431,
@@ -203,11 +198,18 @@ mod tests {
         };
         let node = Some("robot-1".to_owned());
         assert_eq!(read(&given), Some(Answer::Given { held, node }));
-        let unchanged = json!({"id": "7f-2", "unchanged": true, "revision": 431, "hash": "sha256:a", "source": "main"});
+        let unchanged = json!({
+            "id": "7f-2",
+            "unchanged": true,
+            "revision": 431,
+            "hash": "sha256:a",
+            "source": "main",
+        });
         let (hash, source) = ("sha256:a".to_owned(), ConfigSource::Main);
         let revision = 431;
         assert_eq!(read(&unchanged), Some(Answer::Unchanged { revision, hash, source }));
-        let refused = json!({"id": "7f-3", "error": {"code": "not_found", "detail": "no service slamm"}});
+        let refused =
+            json!({"id": "7f-3", "error": {"code": "not_found", "detail": "no service slamm"}});
         let (code, detail) = ("not_found".to_owned(), "no service slamm".to_owned());
         assert_eq!(read(&refused), Some(Answer::Refused(Refusal { code, detail })));
     }
@@ -215,10 +217,22 @@ mod tests {
     #[test]
     fn answers_to_others_and_what_is_no_answer_are_left_alone() {
         for other in [
-            json!({"id": "8e-1", "unchanged": true, "revision": 1, "hash": "sha256:a", "source": "main"}),
+            json!({
+                "id": "8e-1",
+                "unchanged": true,
+                "revision": 1,
+                "hash": "sha256:a",
+                "source": "main",
+            }),
             json!({"unchanged": true, "revision": 1, "hash": "sha256:a", "source": "main"}),
             json!({"id": "7f-1", "revision": 1, "hash": "sha256:a", "source": "main", "config": 7}),
-            json!({"id": "7f-1", "revision": -1, "hash": "sha256:a", "source": "main", "config": {}}),
+            json!({
+                "id": "7f-1",
+                "revision": -1,
+                "hash": "sha256:a",
+                "source": "main",
+                "config": {},
+            }),
             json!({"id": 7}),
             json!([]),
         ] {

@@ -12,7 +12,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_domain::TopicName;
-use blaze_domain::control::{Answer, ControlError, ControlMessage, ErrorCode, LeaseKind, WithdrawMessage};
+use blaze_domain::control::{
+    Answer, ControlError, ControlMessage, ErrorCode, LeaseKind, WithdrawMessage,
+};
 use blaze_domain::names::ChannelName;
 use tokio::sync::oneshot;
 
@@ -36,7 +38,8 @@ pub(super) struct LeaseKey {
     pub(super) topic: TopicName,
 }
 
-/// A holder's claim to a lease: it counts only as long as the lease was not replaced by another of the same key.
+/// A holder's claim to a lease: it counts only as long as the lease was not replaced by another of
+/// the same key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Claim {
     pub(super) key: LeaseKey,
@@ -79,7 +82,8 @@ pub(super) struct LeaseBook {
     ttl_s: u32,
     /// Random numbers of 0 to 1.
     random: Box<dyn FnMut() -> f64 + Send>,
-    /// Begins all identities of messages, so that they differ from those of other services on a shared reply topic.
+    /// Begins all identities of messages, so that they differ from those of other services on a
+    /// shared reply topic.
     id_prefix: String,
     records: HashMap<LeaseKey, Record>,
     by_id: HashMap<String, LeaseKey>,
@@ -106,8 +110,8 @@ impl LeaseBook {
         }
     }
 
-    /// Asks for a lease, or for other terms of one that there is. The answer comes to `waiting`. The book says how long the
-    /// lease lasts and where the answer goes.
+    /// Asks for a lease, or for other terms of one that there is. The answer comes to `waiting`.
+    /// The book says how long the lease lasts and where the answer goes.
     pub(super) fn ask(
         &mut self,
         mut message: ControlMessage,
@@ -127,18 +131,12 @@ impl LeaseBook {
                 LeaseKind::Request
             }
             ControlMessage::Withdraw(_) => {
-                return Err(FlowError::Invalid {
-                    field: "op",
-                    reason: "is no lease",
-                });
+                return Err(FlowError::Invalid { field: "op", reason: "is no lease" });
             }
         };
         let common = message.common_mut();
         common.reply_to = Some(self.reply_to.clone());
-        let key = LeaseKey {
-            kind,
-            topic: common.topic.clone(),
-        };
+        let key = LeaseKey { kind, topic: common.topic.clone() };
         if self.records.len() >= MAX_LEASES && !self.records.contains_key(&key) {
             return Err(FlowError::TooManyLeases(MAX_LEASES));
         }
@@ -177,9 +175,14 @@ impl LeaseBook {
         Ok(Claim { key, generation })
     }
 
-    /// A holder leaves; the last one takes the lease with it. `waiting` learns when the flow knows, or at once if there is
-    /// nothing that it must know.
-    pub(super) fn leave(&mut self, claim: &Claim, waiting: Option<oneshot::Sender<AskResult>>, now: Instant) {
+    /// A holder leaves; the last one takes the lease with it. `waiting` learns when the flow knows,
+    /// or at once if there is nothing that it must know.
+    pub(super) fn leave(
+        &mut self,
+        claim: &Claim,
+        waiting: Option<oneshot::Sender<AskResult>>,
+        now: Instant,
+    ) {
         let done = |waiting: Option<oneshot::Sender<AskResult>>| {
             if let Some(waiting) = waiting {
                 let _ = waiting.send(Ok(()));
@@ -208,7 +211,12 @@ impl LeaseBook {
         }
     }
 
-    fn begin_leaving(&mut self, key: &LeaseKey, waiting: Option<oneshot::Sender<AskResult>>, now: Instant) {
+    fn begin_leaving(
+        &mut self,
+        key: &LeaseKey,
+        waiting: Option<oneshot::Sender<AskResult>>,
+        now: Instant,
+    ) {
         let id = self.new_id(key);
         let Some(mut record) = self.records.remove(key) else {
             return;
@@ -218,7 +226,8 @@ impl LeaseBook {
             self.records.insert(key.clone(), record);
             return;
         }
-        let is_unknown = record.agreed.is_none() && matches!(record.state, State::Asking { attempts: 0, .. });
+        let is_unknown =
+            record.agreed.is_none() && matches!(record.state, State::Asking { attempts: 0, .. });
         for asked in record.waiting.drain(..) {
             let _ = asked.send(Err(FlowError::Closed));
         }
@@ -241,7 +250,9 @@ impl LeaseBook {
             let soon = now + RESEND_WITHIN.mul_f64((self.random)().clamp(0.0, 1.0));
             match &mut record.state {
                 State::Held { next } => *next = Some(next.map_or(soon, |next| next.min(soon))),
-                State::Asking { next, .. } | State::Leaving { next, .. } => *next = (*next).min(soon),
+                State::Asking { next, .. } | State::Leaving { next, .. } => {
+                    *next = (*next).min(soon)
+                }
             }
         }
     }
@@ -264,21 +275,19 @@ impl LeaseBook {
             record.agreed = Some(Arc::clone(&record.asked));
             let lease = Duration::from_secs(answer.lease_s.unwrap_or(self.ttl_s).into());
             if matches!(record.state, State::Asking { .. }) {
-                record.state = State::Held {
-                    next: (!lease.is_zero()).then(|| now + lease / 3),
-                };
+                record.state = State::Held { next: (!lease.is_zero()).then(|| now + lease / 3) };
             }
             settle(&mut record, &Ok(()));
         } else {
             let refusal = refusal(answer);
-            tracing::warn!(topic = %key.topic, kind = ?key.kind, error = %refusal, "a flow refused a lease");
-            let superseded = matches!(
-                &refusal,
-                FlowError::Refused {
-                    code: ErrorCode::StaleEpoch,
-                    ..
-                }
+            tracing::warn!(
+                topic = %key.topic,
+                kind = ?key.kind,
+                error = %refusal,
+                "a flow refused a lease",
             );
+            let superseded =
+                matches!(&refusal, FlowError::Refused { code: ErrorCode::StaleEpoch, .. });
             let agreed = record.agreed.clone();
             let Some(agreed) = agreed.filter(|_| !superseded) else {
                 self.forget(record, &Err(refusal));
@@ -288,9 +297,7 @@ impl LeaseBook {
             settle(&mut record, &Err(refusal));
             record.asked = agreed;
             if matches!(record.state, State::Asking { .. }) {
-                record.state = State::Held {
-                    next: Some(now + self.renewal_pause()),
-                };
+                record.state = State::Held { next: Some(now + self.renewal_pause()) };
             }
         }
         self.records.insert(key, record);
@@ -305,10 +312,7 @@ impl LeaseBook {
             .map(|(key, _)| key.clone())
             .collect();
         if due.is_empty()
-            || self
-                .records
-                .values()
-                .all(|record| record.next().is_none_or(|next| next > now))
+            || self.records.values().all(|record| record.next().is_none_or(|next| next > now))
         {
             return Vec::new();
         }
@@ -423,9 +427,7 @@ fn settle(record: &mut Record, result: &AskResult) {
 }
 
 fn pause_after(attempts: u32) -> Duration {
-    FIRST_RETRY
-        .saturating_mul(2_u32.saturating_pow(attempts.min(10)))
-        .min(LONGEST_RETRY)
+    FIRST_RETRY.saturating_mul(2_u32.saturating_pow(attempts.min(10))).min(LONGEST_RETRY)
 }
 
 fn refusal(answer: &Answer) -> FlowError {

@@ -11,10 +11,7 @@ impl Bench {
     fn new() -> Self {
         let reply_to = "blaze/reply/d".parse().unwrap();
         let book = LeaseBook::new(reply_to, "p".into(), 15, Box::new(|| 0.5));
-        Self {
-            book,
-            now: Instant::now(),
-        }
+        Self { book, now: Instant::now() }
     }
 
     fn ask(&mut self, topic: &str, rate_hz: f64) -> (Claim, oneshot::Receiver<AskResult>) {
@@ -53,8 +50,10 @@ fn request(topic: &str) -> ControlMessage {
     ControlMessage::Request(RequestMessage::new(topic.parse().unwrap(), "driver".parse().unwrap()))
 }
 
-const REFUSED: &str = r#"{"ok":false,"error":{"code":"invalid_value","pointer":"/2/rate_hz","detail":"no"}}"#;
-const STALE: &str = r#"{"ok":false,"error":{"code":"stale_epoch","pointer":"/epoch","detail":"newer"}}"#;
+const REFUSED: &str =
+    r#"{"ok":false,"error":{"code":"invalid_value","pointer":"/2/rate_hz","detail":"no"}}"#;
+const STALE: &str =
+    r#"{"ok":false,"error":{"code":"stale_epoch","pointer":"/epoch","detail":"newer"}}"#;
 
 #[test]
 fn it_asks_again_with_the_same_id_and_growing_pauses() {
@@ -72,7 +71,8 @@ fn it_asks_again_with_the_same_id_and_growing_pauses() {
             sent_at.push(bench.now);
         }
     }
-    let pauses: Vec<u128> = sent_at.windows(2).map(|pair| (pair[1] - pair[0]).as_millis()).collect();
+    let pauses: Vec<u128> =
+        sent_at.windows(2).map(|pair| (pair[1] - pair[0]).as_millis()).collect();
     assert_eq!(pauses, [250, 500, 1_000, 2_000, 4_000, 5_000, 5_000]);
     assert_eq!(bench.book.attempts(&claim), 8);
     assert_eq!(bench.book.state(&claim), LeaseState::Asking);
@@ -125,10 +125,7 @@ fn a_refusal_tells_code_and_pointer_and_leaves_nothing() {
     let (claim, mut answered) = bench.ask("imu/data", 50.0);
     let sent = bench.after(0).remove(0);
     bench.answer(&sent, REFUSED);
-    let Err(FlowError::Refused {
-        code, pointer, detail, ..
-    }) = answered.try_recv().unwrap()
-    else {
+    let Err(FlowError::Refused { code, pointer, detail, .. }) = answered.try_recv().unwrap() else {
         panic!("it was refused");
     };
     assert_eq!(
@@ -153,10 +150,7 @@ fn refused_terms_leave_those_agreed_before() {
     bench.book.leave(&second, None, bench.now);
     assert_eq!(bench.book.state(&first), LeaseState::Held);
     let renewal = bench.after(5_000).remove(0);
-    assert_eq!(
-        (&renewal["op"], &renewal["rate_hz"]),
-        (&"advertise".into(), &50.0.into())
-    );
+    assert_eq!((&renewal["op"], &renewal["rate_hz"]), (&"advertise".into(), &50.0.into()));
 }
 
 #[test]
@@ -173,11 +167,7 @@ fn the_last_holder_withdraws_and_a_lost_withdraw_is_sent_again_a_few_times() {
         withdraws.extend(bench.after(10));
     }
     assert_eq!(withdraws.len(), 4);
-    assert!(
-        withdraws
-            .iter()
-            .all(|sent| sent["op"] == "withdraw" && sent["kind"] == "advertise")
-    );
+    assert!(withdraws.iter().all(|sent| sent["op"] == "withdraw" && sent["kind"] == "advertise"));
     assert_eq!(answered.try_recv().unwrap(), Err(FlowError::NoAnswer { attempts: 4 }));
     assert!(bench.book.is_empty() && bench.book.by_id.is_empty());
 }
@@ -205,11 +195,7 @@ fn asking_while_a_withdraw_is_under_way_makes_a_new_lease() {
     let withdraw = bench.after(0).remove(0);
     let (new, _answered) = bench.ask("imu/data", 50.0);
     bench.agree(&withdraw);
-    assert_eq!(
-        bench.book.state(&new),
-        LeaseState::Asking,
-        "the answer was to the withdraw"
-    );
+    assert_eq!(bench.book.state(&new), LeaseState::Asking, "the answer was to the withdraw");
     let sent = bench.after(0);
     assert_eq!((sent.len(), &sent[0]["op"]), (1, &"advertise".into()));
 }

@@ -22,7 +22,11 @@ pub(super) async fn run(shared: Arc<Shared>, broker: Arc<dyn Broker>, own_reply:
     shared.changed.notify_waiters();
 }
 
-async fn drive(shared: &Shared, broker: &dyn Broker, own_reply: ChannelName) -> Result<(), BrokerError> {
+async fn drive(
+    shared: &Shared,
+    broker: &dyn Broker,
+    own_reply: ChannelName,
+) -> Result<(), BrokerError> {
     let reply = reply_channel(broker.kind(), own_reply);
     let mut replies = subscribe(broker, &reply).await?;
     let mut events = subscribe(broker, &ChannelName::events()).await?;

@@ -17,7 +17,8 @@ use blaze_brokers::Broker;
 use blaze_domain::TopicName;
 use blaze_domain::control::ControlMessage;
 pub use blaze_domain::control::{
-    ErrorCode as RefusalCode, Event as FlowEvent, EventKind as FlowEventKind, OriginSelector as OriginFilter,
+    ErrorCode as RefusalCode, Event as FlowEvent, EventKind as FlowEventKind,
+    OriginSelector as OriginFilter,
 };
 use blaze_domain::names::ChannelName;
 use blaze_runtime::{Supervisor, TaskPolicy};
@@ -144,8 +145,9 @@ impl FlowManager {
         Self { shared }
     }
 
-    /// Tells that the service publishes a topic, and waits for a flow to agree. The lease renews itself. Advertising a topic
-    /// that the service advertises already changes the terms; the lease ends with its last holder.
+    /// Tells that the service publishes a topic, and waits for a flow to agree. The lease renews
+    /// itself. Advertising a topic that the service advertises already changes the terms; the lease
+    /// ends with its last holder.
     ///
     /// # Errors
     /// [`FlowError`]: refused, no answer within `control_timeout`, or a value that cannot be.
@@ -166,10 +168,7 @@ impl FlowManager {
     /// What flows tell to all from now on.
     #[must_use]
     pub fn events(&self) -> FlowEvents {
-        FlowEvents {
-            receiver: self.shared.events.subscribe(),
-            missed: 0,
-        }
+        FlowEvents { receiver: self.shared.events.subscribe(), missed: 0 }
     }
 
     async fn ask(&self, message: ControlMessage) -> Result<Lease, FlowError> {
@@ -177,11 +176,7 @@ impl FlowManager {
         let claim = self.shared.book.lock().ask(message, answer, driver::now())?;
         self.shared.wake.notify_one();
         // From here on dropping it withdraws, also when the caller stops waiting.
-        let lease = Lease {
-            shared: Arc::clone(&self.shared),
-            claim,
-            left: false,
-        };
+        let lease = Lease { shared: Arc::clone(&self.shared), claim, left: false };
         self.shared.answered(&lease.claim, answered).await?;
         Ok(lease)
     }
@@ -208,14 +203,13 @@ impl Shared {
         match tokio::time::timeout(self.control_timeout, answered).await {
             Ok(Ok(result)) => result,
             Ok(Err(_)) => Err(FlowError::Closed),
-            Err(_) => Err(FlowError::NoAnswer {
-                attempts: self.book.lock().attempts(claim),
-            }),
+            Err(_) => Err(FlowError::NoAnswer { attempts: self.book.lock().attempts(claim) }),
         }
     }
 }
 
-/// What the service advertises or requests, as long as it is held. Dropping it withdraws it in the background.
+/// What the service advertises or requests, as long as it is held. Dropping it withdraws it in the
+/// background.
 #[must_use = "dropping a lease withdraws it"]
 pub struct Lease {
     shared: Arc<Shared>,

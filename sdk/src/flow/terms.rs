@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use blaze_domain::control::{
-    AdvertiseMessage, DEFAULT_ENCODING, MAX_DEPTH, MAX_ENCODING_BYTES, MAX_TYPE_BYTES, OriginSelector, Quality,
-    RequestMessage,
+    AdvertiseMessage, DEFAULT_ENCODING, MAX_DEPTH, MAX_ENCODING_BYTES, MAX_TYPE_BYTES,
+    OriginSelector, Quality, RequestMessage,
 };
 use blaze_domain::{Durability, MAX_PAYLOAD_BYTES, Priority, Reliability, TopicName};
 

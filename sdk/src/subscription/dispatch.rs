@@ -1,7 +1,8 @@
 //! The queue between a subscription and the threads that run its callback.
 //!
-//! Messages wait per writer. A writer with messages and a free place is *ready*; a ticket in the pool takes the next ready
-//! writer, runs its oldest message and looks again. So writers take turns, each in its order.
+//! Messages wait per writer. A writer with messages and a free place is *ready*; a ticket in the
+//! pool takes the next ready writer, runs its oldest message and looks again. So writers take
+//! turns, each in its order.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -66,7 +67,12 @@ struct Queue {
 }
 
 impl Dispatch {
-    pub(super) fn new(topic: &TopicName, callback: Callback, limits: Limits, counters: Arc<Counters>) -> Self {
+    pub(super) fn new(
+        topic: &TopicName,
+        callback: Callback,
+        limits: Limits,
+        counters: Arc<Counters>,
+    ) -> Self {
         Self {
             topic: topic.clone(),
             callback,
@@ -86,7 +92,8 @@ impl Dispatch {
             return;
         }
         while !state.by_age.is_empty()
-            && (state.by_age.len() >= self.limits.max_messages || state.bytes + size > self.limits.max_bytes)
+            && (state.by_age.len() >= self.limits.max_messages
+                || state.bytes + size > self.limits.max_bytes)
         {
             dropped.extend(state.drop_oldest());
         }
@@ -132,7 +139,11 @@ impl Dispatch {
         let sequence = message.sequence();
         if catch_unwind(AssertUnwindSafe(|| (self.callback)(message))).is_err() {
             self.counters.panicked.add(1);
-            tracing::error!(topic = %self.topic, sequence, "the callback of a subscription panicked");
+            tracing::error!(
+                topic = %self.topic,
+                sequence,
+                "the callback of a subscription panicked",
+            );
         }
     }
 }
@@ -211,7 +222,9 @@ impl State {
         self.running -= 1;
         if let Some(queue) = self.writers.get_mut(&writer) {
             queue.running -= 1;
-            if queue.messages.len() > queue.listed && queue.running + queue.listed < limits.per_writer {
+            if queue.messages.len() > queue.listed
+                && queue.running + queue.listed < limits.per_writer
+            {
                 queue.listed += 1;
                 self.ready.push_back(writer);
             } else if queue.messages.is_empty() && queue.running == 0 && queue.listed == 0 {

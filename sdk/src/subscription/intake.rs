@@ -41,11 +41,7 @@ pub(super) struct Intake {
 impl Intake {
     /// `max_rate_hz` must be a positive number, if given.
     pub(super) fn new(max_rate_hz: Option<f64>, lifespan: Duration) -> Self {
-        Self {
-            spacing: max_rate_hz.map(Spacing::new),
-            lifespan,
-            writers: LruCache::unbounded(),
-        }
+        Self { spacing: max_rate_hz.map(Spacing::new), lifespan, writers: LruCache::unbounded() }
     }
 
     /// Whether the message is for the callback; counts why not.
@@ -93,13 +89,11 @@ impl Intake {
 
 /// Whether a message is older than the publisher's or the subscription's lifespan; zero = none.
 pub(super) fn is_expired(age: Duration, of_publisher: Duration, of_subscription: Duration) -> bool {
-    [of_publisher, of_subscription]
-        .iter()
-        .any(|lifespan| !lifespan.is_zero() && age > *lifespan)
+    [of_publisher, of_subscription].iter().any(|lifespan| !lifespan.is_zero() && age > *lifespan)
 }
 
-/// Lets messages through at a rate at most, evenly; half a period early is early enough, so that a stream of just that rate
-/// is not thinned because it jitters.
+/// Lets messages through at a rate at most, evenly; half a period early is early enough, so that a
+/// stream of just that rate is not thinned because it jitters.
 struct Spacing {
     period: Duration,
     next: Option<Instant>,
@@ -144,11 +138,8 @@ struct Window {
 
 impl Window {
     fn starting_with(sequence: u64) -> Self {
-        let mut window = Self {
-            first: sequence,
-            highest: sequence,
-            bits: [0; (WINDOW / 64) as usize],
-        };
+        let mut window =
+            Self { first: sequence, highest: sequence, bits: [0; (WINDOW / 64) as usize] };
         window.set(sequence);
         window
     }
@@ -169,9 +160,7 @@ impl Window {
             return Seen::Before;
         }
         self.set(sequence);
-        Seen::Late {
-            was_missing: sequence > self.first,
-        }
+        Seen::Late { was_missing: sequence > self.first }
     }
 
     fn place(sequence: u64) -> (usize, u64) {
@@ -230,10 +219,7 @@ mod tests {
         let (mut intake, counters, now) = (plain(), Counters::default(), Instant::now());
         assert!(intake.accept(&arrival(1), now, &counters));
         assert!(intake.accept(&arrival(5_000), now, &counters));
-        assert!(
-            !intake.accept(&arrival(5_000 - WINDOW), now, &counters),
-            "too far below"
-        );
+        assert!(!intake.accept(&arrival(5_000 - WINDOW), now, &counters), "too far below");
         assert!(intake.accept(&arrival(5_000 - WINDOW + 1), now, &counters));
         assert!(intake.accept(&arrival(5_000 + WINDOW - 1), now, &counters));
         assert!(!intake.accept(&arrival(5_000), now, &counters), "still in the window");
@@ -246,25 +232,16 @@ mod tests {
     fn gaps_of_positions_on_a_server_are_no_loss() {
         let (mut intake, counters, now) = (plain(), Counters::default(), Instant::now());
         for sequence in [1, 100, 50] {
-            let arrival = Arrival {
-                gaps_are_loss: false,
-                ..arrival(sequence)
-            };
+            let arrival = Arrival { gaps_are_loss: false, ..arrival(sequence) };
             assert!(intake.accept(&arrival, now, &counters));
         }
         assert_eq!(counters.read().lost, 0);
     }
 
     fn admitted(max_rate_hz: f64, arrivals_ms: impl Iterator<Item = u64>) -> Vec<u64> {
-        let (mut intake, counters, start) = (
-            Intake::new(Some(max_rate_hz), Duration::ZERO),
-            Counters::default(),
-            Instant::now(),
-        );
-        let arrival = Arrival {
-            identity: None,
-            ..arrival(1)
-        };
+        let (mut intake, counters, start) =
+            (Intake::new(Some(max_rate_hz), Duration::ZERO), Counters::default(), Instant::now());
+        let arrival = Arrival { identity: None, ..arrival(1) };
         arrivals_ms
             .filter(|ms| intake.accept(&arrival, start + Duration::from_millis(*ms), &counters))
             .collect()
@@ -274,10 +251,7 @@ mod tests {
     fn thins_to_the_rate_asked_for() {
         let through = admitted(10.0, (0..10_000).step_by(20));
         assert!((99..=101).contains(&through.len()), "{}", through.len());
-        assert!(
-            through.windows(2).skip(1).all(|pair| pair[1] - pair[0] == 100),
-            "{through:?}"
-        );
+        assert!(through.windows(2).skip(1).all(|pair| pair[1] - pair[0] == 100), "{through:?}");
         // 30 Hz to 20 Hz: the average is kept though the periods do not fit.
         let through = admitted(20.0, (0..300).map(|n| n * 1_000 / 30));
         assert!((199..=202).contains(&through.len()), "{}", through.len());
@@ -303,14 +277,8 @@ mod tests {
             ..arrival(sequence)
         };
         assert!(intake.accept(&with(1, 100, 0), now, &counters));
-        assert!(
-            !intake.accept(&with(2, 101, 0), now, &counters),
-            "the subscription's lifespan"
-        );
-        assert!(
-            !intake.accept(&with(3, 51, 50), now, &counters),
-            "the publisher's lifespan"
-        );
+        assert!(!intake.accept(&with(2, 101, 0), now, &counters), "the subscription's lifespan");
+        assert!(!intake.accept(&with(3, 51, 50), now, &counters), "the publisher's lifespan");
         assert!(intake.accept(&with(4, 50, 50), now, &counters));
         let stats = counters.read();
         assert_eq!((stats.expired, stats.lost), (2, 0));
@@ -322,10 +290,7 @@ mod tests {
         for number in 0..MAX_WRITERS + 10 {
             let mut writer = [0; 16];
             writer[..8].copy_from_slice(&number.to_le_bytes());
-            let arrival = Arrival {
-                identity: Some((WriterId(writer), 1)),
-                ..arrival(1)
-            };
+            let arrival = Arrival { identity: Some((WriterId(writer), 1)), ..arrival(1) };
             assert!(intake.accept(&arrival, now, &counters));
         }
         assert_eq!(intake.writers.len(), MAX_WRITERS);

@@ -1,5 +1,5 @@
-//! Subscriptions: from the broker's ring, through [`intake`] (repeats, lifespan, rate), into the bounded queue of
-//! [`dispatch`], to the callback on a thread of the pool.
+//! Subscriptions: from the broker's ring, through [`intake`] (repeats, lifespan, rate), into the
+//! bounded queue of [`dispatch`], to the callback on a thread of the pool.
 
 mod dispatch;
 mod intake;
@@ -62,12 +62,8 @@ impl Default for SubscribeOptions {
 
 impl SubscribeOptions {
     pub(crate) fn check(&self) -> Result<(), SdkError> {
-        let refuse = |option, reason: &str| {
-            Err(SdkError::Option {
-                option,
-                reason: reason.to_owned(),
-            })
-        };
+        let refuse =
+            |option, reason: &str| Err(SdkError::Option { option, reason: reason.to_owned() });
         if self.max_rate_hz.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
             return refuse("max_rate_hz", "must be above 0");
         }
@@ -80,7 +76,8 @@ impl SubscribeOptions {
         Ok(())
     }
 
-    /// The ring of the port takes what comes between two turns of the reading task; it may be as large as the queue.
+    /// The ring of the port takes what comes between two turns of the reading task; it may be as
+    /// large as the queue.
     pub(crate) fn of_the_port(&self) -> blaze_brokers::SubscribeOptions {
         blaze_brokers::SubscribeOptions {
             max_messages: self.max_messages.max(BATCH),
@@ -91,7 +88,8 @@ impl SubscribeOptions {
     }
 }
 
-/// A subscription that lives. Dropping it ends it: no callback begins afterwards, one that runs goes on to its end.
+/// A subscription that lives. Dropping it ends it: no callback begins afterwards, one that runs
+/// goes on to its end.
 #[must_use = "dropping a subscription ends it"]
 pub struct Subscription {
     topic: TopicName,
@@ -175,12 +173,7 @@ pub(crate) fn start(
             () = reading.run(source) => {}
         }
     });
-    Subscription {
-        topic: topic.clone(),
-        dispatch,
-        counters,
-        ended,
-    }
+    Subscription { topic: topic.clone(), dispatch, counters, ended }
 }
 
 /// Takes messages from the broker until it closes.

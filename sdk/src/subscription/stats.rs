@@ -10,8 +10,8 @@ pub struct SubscriptionStats {
     pub received: u64,
     /// Handed to the callback.
     pub delivered: u64,
-    /// Missing between the first and the last sequence received of a writer. What a flow left out on the way, because of the
-    /// rate asked for or the budget, is missing as well.
+    /// Missing between the first and the last sequence received of a writer. What a flow left out
+    /// on the way, because of the rate asked for or the budget, is missing as well.
     pub lost: u64,
     /// Repeats, by writer and sequence; left out.
     pub duplicated: u64,

@@ -58,10 +58,7 @@ impl Api {
             .tcp_nodelay(true)
             .timeout(ANSWER)
             .build()?;
-        Ok(Self {
-            http,
-            base: format!("http://{rest}/api/v1"),
-        })
+        Ok(Self { http, base: format!("http://{rest}/api/v1") })
     }
 
     /// Any request; a precondition is given that everything fulfils.
@@ -86,7 +83,12 @@ impl Api {
     ///
     /// # Errors
     /// When it does not.
-    pub async fn must(&self, method: Method, path: &str, body: Option<&Value>) -> anyhow::Result<Value> {
+    pub async fn must(
+        &self,
+        method: Method,
+        path: &str,
+        body: Option<&Value>,
+    ) -> anyhow::Result<Value> {
         match self.send(method.clone(), path, body).await {
             Told::Done(answer) => Ok(answer),
             other => anyhow::bail!("{method} {path}: {other:?}"),
@@ -121,11 +123,7 @@ impl Api {
         let response = request.send().await?;
         let answered = Instant::now();
         match read(response).await {
-            Told::Done(answer) => Ok(Written {
-                revision: revision(&answer)?,
-                sent,
-                answered,
-            }),
+            Told::Done(answer) => Ok(Written { revision: revision(&answer)?, sent, answered }),
             other => anyhow::bail!("PUT {path}: {other:?}"),
         }
     }
@@ -155,9 +153,7 @@ impl Api {
 }
 
 fn revision(answer: &Value) -> anyhow::Result<u64> {
-    answer["revision"]
-        .as_u64()
-        .with_context(|| format!("no revision: {answer}"))
+    answer["revision"].as_u64().with_context(|| format!("no revision: {answer}"))
 }
 
 async fn read(response: reqwest::Response) -> Told {
@@ -174,9 +170,6 @@ async fn read(response: reqwest::Response) -> Told {
         status if status.is_success() => Told::Done(body),
         _ if body["applied"] == "unknown" => Told::Unknown(body.to_string()),
         status if status.is_server_error() => Told::NotNow(body.to_string()),
-        status => Told::Refused {
-            status: status.as_u16(),
-            problem: body,
-        },
+        status => Told::Refused { status: status.as_u16(), problem: body },
     }
 }

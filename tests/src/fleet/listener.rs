@@ -37,38 +37,34 @@ impl Listener {
     ///
     /// # Errors
     /// When the worker gives it none in time.
-    pub async fn start(worker: &Worker, service: &str, instance: &str, limit: Duration) -> anyhow::Result<Self> {
+    pub async fn start(
+        worker: &Worker,
+        service: &str,
+        instance: &str,
+        limit: Duration,
+    ) -> anyhow::Result<Self> {
         let broker = worker.open_broker()?;
-        let options = ServiceOptions::new(worker.layer().clone(), service.parse()?, broker, worker.scope());
+        let options =
+            ServiceOptions::new(worker.layer().clone(), service.parse()?, broker, worker.scope());
         let options = ServiceOptions {
             instance: instance.parse()?,
             ..options.on_node(worker.node().clone())
         };
         let service = ServiceManager::start(options).await?;
         let config = service.config();
-        config
-            .ready(limit)
-            .await
-            .with_context(|| format!("at {}", worker.node()))?;
+        config.ready(limit).await.with_context(|| format!("at {}", worker.node()))?;
         let first = config.revision().unwrap_or_default();
         let (tell, heard) = mpsc::channel(WAITING);
         let callback = config.on_change(move |change| {
-            let heard = Heard {
-                at: Instant::now(),
-                revision: change.revision,
-                config: change.new.clone(),
-            };
+            let heard =
+                Heard { at: Instant::now(), revision: change.revision, config: change.new.clone() };
             // The first configuration may be told of only now.
             if change.revision > first {
                 // Whoever does not look at 4,096 changes has gone.
                 let _ = tell.try_send(heard);
             }
         });
-        Ok(Self {
-            service,
-            heard,
-            _callback: callback,
-        })
+        Ok(Self { service, heard, _callback: callback })
     }
 
     /// The next change.
@@ -80,10 +76,7 @@ impl Listener {
         let who = self.service.identity();
         next.ok().flatten().with_context(|| {
             let node = who.node.as_ref().map(ToString::to_string).unwrap_or_default();
-            format!(
-                "{} {} at {node:?} heard nothing within {limit:?}",
-                who.service, who.instance
-            )
+            format!("{} {} at {node:?} heard nothing within {limit:?}", who.service, who.instance)
         })
     }
 

@@ -46,23 +46,21 @@ impl MainService {
         let (rest, grpc) = (local(free_port()?), local(free_port()?));
         let store = match store {
             MainStore::Sqlite => json!({ "sqlite": { "path": folder.join("main.db") } }),
-            MainStore::Mongo { uri, database } => json!({ "mongodb": { "uri": uri, "database": database } }),
+            MainStore::Mongo { uri, database } => {
+                json!({ "mongodb": { "uri": uri, "database": database } })
+            }
         };
         let file = json!({
             "log": { "level": "warn" },
             "control_plane": {
-                "rest": { "listen": rest }, "grpc": { "listen": grpc }, "admin": { "listen": "127.0.0.1:0" }, "store": store,
+                "rest": { "listen": rest }, "grpc": { "listen": grpc },
+                "admin": { "listen": "127.0.0.1:0" }, "store": store,
             },
         });
         let node_file = folder.join("main.yaml");
         // JSON is YAML.
         std::fs::write(&node_file, file.to_string())?;
-        let mut main = Self {
-            node_file,
-            process: None,
-            rest,
-            grpc,
-        };
+        let mut main = Self { node_file, process: None, rest, grpc };
         main.start_again()?;
         Ok(main)
     }

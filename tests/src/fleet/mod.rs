@@ -1,5 +1,5 @@
-//! Many workers of BlazeConfig beside one real main service: in this process, each with a broker, copies and, if wanted, a
-//! service of its own, or as processes.
+//! Many workers of BlazeConfig beside one real main service: in this process, each with a broker,
+//! copies and, if wanted, a service of its own, or as processes.
 //!
 //! ```text
 //! Api ──REST──▶ MainService (process) ──gRPC──▶ Worker, Worker, … (this process) ──broker──▶ Listener (SDK)

@@ -21,8 +21,8 @@ pub struct WorkerProcess {
 }
 
 impl WorkerProcess {
-    /// Starts one, with its node file and copies in a folder; ready on return, and so it needs a main service or a copy. Blocks
-    /// the thread.
+    /// Starts one, with its node file and copies in a folder; ready on return, and so it needs a
+    /// main service or a copy. Blocks the thread.
     ///
     /// # Errors
     /// When it is not built or does not start.
@@ -37,13 +37,7 @@ impl WorkerProcess {
         let path = path.to_str().context("the folder has a name in UTF-8")?;
         let process = Process::start("blaze-worker", &["--config", path], None)?;
         let address = process.ready_at("admin", START)?;
-        Ok(Self {
-            process,
-            admin: Admin {
-                address,
-                namespace: None,
-            },
-        })
+        Ok(Self { process, admin: Admin { address, namespace: None } })
     }
 
     /// `/v1/status`. Blocks the thread.

@@ -38,8 +38,8 @@ pub struct Restarted {
     pub refused_since: usize,
 }
 
-/// Kills the main service, leaves it away for a time and starts it again, while eight users read what is at a path of it, 100
-/// times a second at most each. Needs a runtime with several threads.
+/// Kills the main service, leaves it away for a time and starts it again, while eight users read
+/// what is at a path of it, 100 times a second at most each. Needs a runtime with several threads.
 ///
 /// # Errors
 /// When the main service does not start, or a worker does not come back within a minute.
@@ -64,11 +64,7 @@ pub async fn restart(
     let back = come_back(workers, ready).await?;
     tokio::time::sleep(AFTER).await;
     stop.store(true, Ordering::Release);
-    let mut restarted = Restarted {
-        away: ready - killed,
-        back,
-        ..Restarted::default()
-    };
+    let mut restarted = Restarted { away: ready - killed, back, ..Restarted::default() };
     while let Some(done) = users.join_next().await {
         for (begun, taken, is_answered) in done? {
             if is_answered {
@@ -125,7 +121,11 @@ async fn read(api: Api, path: &str, stop: Arc<AtomicBool>) -> Vec<(Instant, Dura
 ///
 /// # Errors
 /// When one has not within the limit.
-pub async fn wait_equal(api: &Api, workers: &[Worker], limit: Duration) -> anyhow::Result<Duration> {
+pub async fn wait_equal(
+    api: &Api,
+    workers: &[Worker],
+    limit: Duration,
+) -> anyhow::Result<Duration> {
     let begun = Instant::now();
     let layer = workers.first().context("there are workers")?.layer();
     let mut left: Vec<&Worker> = workers.iter().collect();

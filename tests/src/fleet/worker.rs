@@ -1,4 +1,5 @@
-//! A worker in this process: what `blaze-worker` puts together from a node file, without the process around it.
+//! A worker in this process: what `blaze-worker` puts together from a node file, without the
+//! process around it.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -50,18 +51,17 @@ impl WorkerSpec {
     #[must_use]
     pub fn on_redis(self, url: &str) -> Self {
         let prefix = format!("{}:", self.node);
-        Self {
-            brokers: json!({ "node": { "redis": { "url": url, "prefix": prefix } } }),
-            ..self
-        }
+        Self { brokers: json!({ "node": { "redis": { "url": url, "prefix": prefix } } }), ..self }
     }
 
-    /// The same on the Kafka of its layer, with a prefix of its own: each worker is then the only one of its topics.
+    /// The same on the Kafka of its layer, with a prefix of its own: each worker is then the only
+    /// one of its topics.
     #[must_use]
     pub fn on_kafka(self, bootstrap: &str) -> Self {
         let prefix = format!("{}.", self.node);
         Self {
-            brokers: json!({ "layer": { "kafka": { "bootstrap": [bootstrap], "prefix": prefix } } }),
+            brokers: json!({ "layer": { "kafka": { "bootstrap": [bootstrap],
+                "prefix": prefix } } }),
             ..self
         }
     }
@@ -69,10 +69,7 @@ impl WorkerSpec {
     /// The same with copies in a folder.
     #[must_use]
     pub fn kept_in(self, folder: PathBuf) -> Self {
-        Self {
-            folder: Some(folder),
-            ..self
-        }
+        Self { folder: Some(folder), ..self }
     }
 
     /// The node file that says so.
@@ -100,7 +97,8 @@ pub struct Standing {
     pub digest: String,
 }
 
-/// A running worker. It ends when it is dropped, as a process does that is killed: copies keep what was written.
+/// A running worker. It ends when it is dropped, as a process does that is killed: copies keep what
+/// was written.
 pub struct Worker {
     running: RunningWorker,
     supervisor: Supervisor,
@@ -141,10 +139,8 @@ impl Worker {
         };
         let (file, _) = NodeFile::read(&spec.node_file()).map_err(faults)?;
         let settings = WorkerSettings::of(&file).map_err(faults)?;
-        let place = Place {
-            hub: MemoryHub::new(spec.node.as_str()),
-            section: settings.broker.clone(),
-        };
+        let place =
+            Place { hub: MemoryHub::new(spec.node.as_str()), section: settings.broker.clone() };
         let broker = place.open(&Role::Worker)?;
         let keys = settings.keys.as_ref().map(RedisKeys::open).transpose()?.map(Arc::new);
         let (layer, node) = (settings.site.layer.clone(), settings.node.clone());
@@ -160,13 +156,7 @@ impl Worker {
         };
         let supervisor = Supervisor::new(node.to_string());
         let running = RunningWorker::start(options, &supervisor).await?;
-        Ok(Self {
-            running,
-            supervisor,
-            place,
-            layer,
-            node,
-        })
+        Ok(Self { running, supervisor, place, layer, node })
     }
 
     /// The worker itself.

@@ -37,7 +37,9 @@ impl LinkProcess {
     /// # Errors
     /// When it is not built, or the machine does not let it make TUN devices.
     pub(super) fn start(link: &WanLink, a: (&str, &str), b: (&str, &str)) -> anyhow::Result<Self> {
-        let set = |ways, shape: &crate::wan::Shape| serde_json::to_string(&Command::Set(ways, shape.changes()));
+        let set = |ways, shape: &crate::wan::Shape| {
+            serde_json::to_string(&Command::Set(ways, shape.changes()))
+        };
         let mut child = std::process::Command::new(binary("blaze-testbed")?)
             .arg("wan")
             .args(["--a", a.0, "--a-device", a.1, "--a-mtu", &link.forward.mtu.to_string()])

@@ -1,6 +1,7 @@
 //! Several hosts on one machine: network namespaces, the wires, switches and links between them.
 //!
-//! [`Topology`] builds what a [`Plan`] says: hosts, LAN segments, WAN links through `blaze-wan`, and the routes.
+//! [`Topology`] builds what a [`Plan`] says: hosts, LAN segments, WAN links through `blaze-wan`,
+//! and the routes.
 
 mod link;
 mod namespace;

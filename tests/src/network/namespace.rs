@@ -18,10 +18,8 @@ const FOLDER: &str = "/var/run/netns";
 /// # Errors
 /// When it fails; the message holds what it printed.
 pub fn run(command: &str) -> anyhow::Result<String> {
-    let output = Command::new("bash")
-        .args(["-c", command])
-        .output()
-        .with_context(|| command.to_owned())?;
+    let output =
+        Command::new("bash").args(["-c", command]).output().with_context(|| command.to_owned())?;
     let text = format!(
         "{}{}",
         String::from_utf8_lossy(&output.stdout),
@@ -31,17 +29,21 @@ pub fn run(command: &str) -> anyhow::Result<String> {
     Ok(text)
 }
 
-/// Does something on a thread of its own inside a namespace. Sockets that are made there stay there, and so do threads that
-/// are started there, such as those of a client library.
+/// Does something on a thread of its own inside a namespace. Sockets that are made there stay
+/// there, and so do threads that are started there, such as those of a client library.
 ///
 /// # Errors
 /// When there is no such namespace or this is not root, and what `act` says.
-pub fn inside<T: Send>(namespace: &str, act: impl FnOnce() -> anyhow::Result<T> + Send) -> anyhow::Result<T> {
+pub fn inside<T: Send>(
+    namespace: &str,
+    act: impl FnOnce() -> anyhow::Result<T> + Send,
+) -> anyhow::Result<T> {
     let path = Path::new(FOLDER).join(namespace);
     let handle = File::open(&path).with_context(|| format!("the namespace {namespace}"))?;
     std::thread::scope(|scope| {
         let thread = scope.spawn(move || {
-            setns(handle, CloneFlags::CLONE_NEWNET).with_context(|| format!("entering {namespace}"))?;
+            setns(handle, CloneFlags::CLONE_NEWNET)
+                .with_context(|| format!("entering {namespace}"))?;
             act()
         });
         match thread.join() {
@@ -55,7 +57,11 @@ pub fn inside<T: Send>(namespace: &str, act: impl FnOnce() -> anyhow::Result<T> 
 ///
 /// # Errors
 /// When nobody accepts it in time.
-pub fn connect(namespace: Option<&str>, address: SocketAddr, timeout: Duration) -> anyhow::Result<TcpStream> {
+pub fn connect(
+    namespace: Option<&str>,
+    address: SocketAddr,
+    timeout: Duration,
+) -> anyhow::Result<TcpStream> {
     let connect = || Ok(TcpStream::connect_timeout(&address, timeout)?);
     match namespace {
         None => connect(),
@@ -63,8 +69,8 @@ pub fn connect(namespace: Option<&str>, address: SocketAddr, timeout: Duration) 
     }
 }
 
-/// A program to be run inside a namespace if one is named. `ip netns exec` replaces itself, so the process id is that of the
-/// program.
+/// A program to be run inside a namespace if one is named. `ip netns exec` replaces itself, so the
+/// process id is that of the program.
 #[must_use]
 pub fn program(namespace: Option<&str>, program: impl AsRef<std::ffi::OsStr>) -> Command {
     match namespace {
@@ -89,12 +95,9 @@ pub(super) fn batch(namespace: &str, lines: &[String]) -> anyhow::Result<()> {
         .stderr(Stdio::piped())
         .spawn()
         .context("starting ip")?;
-    // It reads all before it says much, and what it says is short: neither side waits for the other.
-    child
-        .stdin
-        .take()
-        .context("no pipe to ip")?
-        .write_all(lines.join("\n").as_bytes())?;
+    // It reads all before it says much, and what it says is short: neither side waits for the
+    // other.
+    child.stdin.take().context("no pipe to ip")?.write_all(lines.join("\n").as_bytes())?;
     let output = child.wait_with_output()?;
     anyhow::ensure!(
         output.status.success(),
@@ -157,7 +160,8 @@ pub(super) fn check_rights() -> anyhow::Result<()> {
     let user = run("id -u")?;
     anyhow::ensure!(
         user.trim() == "0",
-        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" cargo nextest run -E 'binary(net)'`"
+        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" \
+         cargo nextest run -E 'binary(net)'`"
     );
     for tool in ["ip", "nft"] {
         anyhow::ensure!(

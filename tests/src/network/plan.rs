@@ -2,7 +2,8 @@
 
 use crate::wan::Shape;
 
-/// Hosts and what joins them. A host with several interfaces is a router; every host reaches every other one.
+/// Hosts and what joins them. A host with several interfaces is a router; every host reaches every
+/// other one.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Plan {
     /// Names, unique; the first segment or link of a host gives it its address.

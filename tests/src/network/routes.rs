@@ -57,11 +57,7 @@ pub(super) fn networks(plan: &Plan) -> anyhow::Result<Vec<Network>> {
         let host = *hosts.get(name).with_context(|| format!("{name} is no host"))?;
         let number = interfaces[host];
         interfaces[host] += 1;
-        Ok(Interface {
-            host,
-            name: format!("{letter}{number}"),
-            address,
-        })
+        Ok(Interface { host, name: format!("{letter}{number}"), address })
     };
     let mut networks = Vec::new();
     for (number, segment) in plan.segments.iter().enumerate() {
@@ -101,7 +97,8 @@ pub(super) fn networks(plan: &Plan) -> anyhow::Result<Vec<Network>> {
 /// # Errors
 /// When one cannot be reached.
 pub(super) fn routes(host: usize, networks: &[Network]) -> anyhow::Result<Vec<Route>> {
-    // From network to network; `first` is the host on the first one through which the others are reached.
+    // From network to network; `first` is the host on the first one through which the others are
+    // reached.
     let mut first: Vec<Option<(Ipv4Addr, String)>> = vec![None; networks.len()];
     let mut known = vec![false; networks.len()];
     let mut next = VecDeque::new();
@@ -121,7 +118,8 @@ pub(super) fn routes(host: usize, networks: &[Network]) -> anyhow::Result<Vec<Ro
                 (None, None) => continue,
             };
             for (index, network) in networks.iter().enumerate() {
-                if known[index] || !network.members.iter().any(|member| member.host == router.host) {
+                if known[index] || !network.members.iter().any(|member| member.host == router.host)
+                {
                     continue;
                 }
                 known[index] = true;
@@ -151,12 +149,7 @@ mod tests {
     use crate::wan::Shape;
 
     fn route(to: [u8; 4], bits: u8, via: [u8; 4], interface: &str) -> Route {
-        Route {
-            to: to.into(),
-            bits,
-            via: via.into(),
-            interface: interface.to_owned(),
-        }
+        Route { to: to.into(), bits, via: via.into(), interface: interface.to_owned() }
     }
 
     #[test]
@@ -171,14 +164,8 @@ mod tests {
             .map(|network| network.members.iter().map(|member| member.name.as_str()).collect())
             .collect();
         assert_eq!(names, [["v0", "v0"], ["w1", "w0"]]);
-        assert_eq!(
-            routes(0, &networks).unwrap(),
-            [route([10, 2, 0, 0], 30, [10, 1, 0, 2], "v0")]
-        );
+        assert_eq!(routes(0, &networks).unwrap(), [route([10, 2, 0, 0], 30, [10, 1, 0, 2], "v0")]);
         assert_eq!(routes(1, &networks).unwrap(), []);
-        assert_eq!(
-            routes(2, &networks).unwrap(),
-            [route([10, 1, 0, 0], 24, [10, 2, 0, 1], "w0")]
-        );
+        assert_eq!(routes(2, &networks).unwrap(), [route([10, 1, 0, 0], 24, [10, 2, 0, 1], "w0")]);
     }
 }

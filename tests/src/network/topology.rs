@@ -12,7 +12,8 @@ use super::plan::Plan;
 use super::routes::{Network, networks, routes};
 use crate::wait;
 
-/// Packets that a device holds for `blaze-wan` while it waits for the processor: 10,000 are 90 ms at 160 Mbit/s.
+/// Packets that a device holds for `blaze-wan` while it waits for the processor: 10,000 are 90 ms
+/// at 160 Mbit/s.
 const DEVICE_QUEUE: u32 = 10_000;
 
 /// Measured: at most 1 s. The rest is for a machine that does much else.
@@ -38,21 +39,25 @@ pub struct Topology {
 }
 
 impl Topology {
-    /// Builds what a plan says. Nothing of it is seen outside, so networks of several tests, and of several runs, live side
-    /// by side with the same addresses.
+    /// Builds what a plan says. Nothing of it is seen outside, so networks of several tests, and of
+    /// several runs, live side by side with the same addresses.
     ///
     /// # Errors
-    /// When the plan has faults, or the machine does not allow it: namespaces need root and iproute2, links `/dev/net/tun`.
+    /// When the plan has faults, or the machine does not allow it: namespaces need root and
+    /// iproute2, links `/dev/net/tun`.
     pub fn build(plan: &Plan) -> anyhow::Result<Self> {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         check_rights()?;
         let networks = networks(plan)?;
-        let prefix = format!("blaze-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+        let prefix =
+            format!("blaze-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         let mut namespaces = Vec::new();
         let mut hosts = Vec::new();
         for (index, name) in plan.hosts.iter().enumerate() {
             let namespace = Namespace::new(format!("{prefix}t{index}"))?;
-            let first = |network: &Network| network.members.iter().find(|member| member.host == index).cloned();
+            let first = |network: &Network| {
+                network.members.iter().find(|member| member.host == index).cloned()
+            };
             let first = networks.iter().find_map(first).context("a host without an interface")?;
             hosts.push(Host {
                 name: name.clone(),
@@ -79,11 +84,7 @@ impl Topology {
             });
             batch(&host.namespace, &lines.collect::<Vec<_>>())?;
         }
-        Ok(Self {
-            links,
-            hosts,
-            _namespaces: namespaces,
-        })
+        Ok(Self { links, hosts, _namespaces: namespaces })
     }
 
     /// A host by its name.
@@ -95,7 +96,8 @@ impl Topology {
         host.with_context(|| format!("{name} is no host"))
     }
 
-    /// The link between two hosts, seen from the first: forward is from `a` to `b`, however the plan names them.
+    /// The link between two hosts, seen from the first: forward is from `a` to `b`, however the
+    /// plan names them.
     ///
     /// # Errors
     /// When the plan has none.
@@ -106,7 +108,12 @@ impl Topology {
 }
 
 /// One bridge for each segment, all in one namespace.
-fn build_segments(plan: &Plan, networks: &[Network], hosts: &[Host], switch: &Namespace) -> anyhow::Result<()> {
+fn build_segments(
+    plan: &Plan,
+    networks: &[Network],
+    hosts: &[Host],
+    switch: &Namespace,
+) -> anyhow::Result<()> {
     let mut ports = Vec::new();
     for (number, (segment, network)) in plan.segments.iter().zip(networks).enumerate() {
         ports.push(format!("link add b{number} type bridge mcast_snooping 0"));
@@ -134,10 +141,12 @@ fn build_segments(plan: &Plan, networks: &[Network], hosts: &[Host], switch: &Na
     forwarding(switch, members)
 }
 
-/// Waits until every port of the switches forwards: the kernel opens them up to a second after they were set up, and until
-/// then multicast is lost without a word.
+/// Waits until every port of the switches forwards: the kernel opens them up to a second after they
+/// were set up, and until then multicast is lost without a word.
 fn forwarding(switch: &Namespace, ports: usize) -> anyhow::Result<()> {
-    let list = || run(&format!("ip -n {} -d link show type bridge_slave", switch.name())).unwrap_or_default();
+    let list = || {
+        run(&format!("ip -n {} -d link show type bridge_slave", switch.name())).unwrap_or_default()
+    };
     wait::until(
         "every port of the switches forwards",
         PORTS,
@@ -147,10 +156,12 @@ fn forwarding(switch: &Namespace, ports: usize) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn build_link(link: &super::WanLink, network: &Network, hosts: &[Host]) -> anyhow::Result<LinkProcess> {
-    let [a, b] = &network.members[..] else {
-        anyhow::bail!("a link has two ends")
-    };
+fn build_link(
+    link: &super::WanLink,
+    network: &Network,
+    hosts: &[Host],
+) -> anyhow::Result<LinkProcess> {
+    let [a, b] = &network.members[..] else { anyhow::bail!("a link has two ends") };
     let process = LinkProcess::start(
         link,
         (&hosts[a.host].namespace, &a.name),

@@ -33,7 +33,8 @@ pub struct Scenario {
     pub publishers: Vec<Service>,
     /// Who listens.
     pub consumers: Vec<Service>,
-    /// What happens when, counted from the moment when every consumer has received something of every topic.
+    /// What happens when, counted from the moment when every consumer has received something of
+    /// every topic.
     pub faults: Vec<(Duration, Fault)>,
     /// How long is published from that moment on.
     pub duration: Duration,
@@ -112,7 +113,8 @@ pub struct Stream {
     pub bytes: usize,
     /// Zero = for ever.
     pub lifespan: Duration,
-    /// A file with payloads that are published in turn; without it they are noise, which cannot be compressed.
+    /// A file with payloads that are published in turn; without it they are noise, which cannot be
+    /// compressed.
     pub payloads: Option<&'static str>,
 }
 
@@ -142,11 +144,13 @@ pub enum Fault {
 pub enum Expect {
     /// From the first message received to the last one published: each once and in order.
     Whole(&'static str, &'static str),
-    /// None twice and in order; of those from the first received to the last published at most this share is lost.
+    /// None twice and in order; of those from the first received to the last published at most this
+    /// share is lost.
     LostAtMost(&'static str, &'static str, f64),
     /// This many at least.
     Received(&'static str, &'static str, u64),
-    /// The last message published came: the route is whole in the end, whatever happened on the way.
+    /// The last message published came: the route is whole in the end, whatever happened on the
+    /// way.
     Alive(&'static str, &'static str),
     /// In every flow every bridge has, in the end, `in = out + dropped + queued`.
     Balanced,

@@ -26,12 +26,14 @@ pub struct Route {
     pub duplicated: u64,
     /// Came after a later one.
     pub reordered: u64,
-    /// From publishing to the consumer's callback, ms, sorted; of the time in which faults are played.
+    /// From publishing to the consumer's callback, ms, sorted; of the time in which faults are
+    /// played.
     pub latencies_ms: Vec<f64>,
 }
 
 impl Route {
-    /// Missing between the first received and the last received: while publishers go on, what came after that may be on its way.
+    /// Missing between the first received and the last received: while publishers go on, what came
+    /// after that may be on its way.
     #[must_use]
     pub fn gaps(&self) -> u64 {
         self.lost.saturating_sub(self.sent.saturating_sub(self.last))
@@ -165,7 +167,8 @@ impl Report {
                 None => Some(format!("there is no {topic} at {consumer}")),
             },
             Expect::Balanced | Expect::Growth(_) => {
-                let faults: Vec<String> = self.flows.iter().filter_map(|flow| flow.faults(expect)).collect();
+                let faults: Vec<String> =
+                    self.flows.iter().filter_map(|flow| flow.faults(expect)).collect();
                 (!faults.is_empty()).then(|| faults.join("\n"))
             }
         });
@@ -224,10 +227,7 @@ mod tests {
     fn what_is_expected_is_checked() {
         let report = report();
         let route = &report.routes[0];
-        assert_eq!(
-            (route.latency_ms(0.5), route.latency_ms(0.99)),
-            (Some(50.0), Some(99.0))
-        );
+        assert_eq!((route.latency_ms(0.5), route.latency_ms(0.99)), (Some(50.0), Some(99.0)));
         report
             .check(&[
                 Expect::LostAtMost("recorder", "imu", 0.01),
@@ -248,11 +248,8 @@ mod tests {
 
     #[test]
     fn flows_that_grow_or_lose_count_are_found() {
-        let usage = |resident_kib, threads, descriptors| Usage {
-            resident_kib,
-            threads,
-            descriptors,
-        };
+        let usage =
+            |resident_kib, threads, descriptors| Usage { resident_kib, threads, descriptors };
         let mut report = report();
         report.flows.push(FlowReport {
             node: "cloud-1".to_owned(),
@@ -260,9 +257,7 @@ mod tests {
             last: usage(1_100, 11, 20),
             ..FlowReport::default()
         });
-        report
-            .check(&[Expect::Balanced, Expect::Growth(usage(100, 1, 0))])
-            .unwrap();
+        report.check(&[Expect::Balanced, Expect::Growth(usage(100, 1, 0))]).unwrap();
         for most in [usage(99, 1, 0), usage(100, 0, 0)] {
             assert!(report.check(&[Expect::Growth(most)]).is_err(), "{most}");
         }

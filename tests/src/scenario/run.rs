@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use serde_json::Value;
 
-use super::{Broker, BrokerKind, Fault, Flow, FlowReport, Report, Route, Scenario, Service, Stream};
+use super::{
+    Broker, BrokerKind, Fault, Flow, FlowReport, Report, Route, Scenario, Service, Stream,
+};
 use crate::flow::{FlowProcess, FlowSpec};
 use crate::network::{Host, Link, Topology};
 use crate::process::{Process, Signal, Usage};
@@ -24,7 +26,8 @@ const WARM: u32 = 5;
 /// Beyond the time that it is published for, so that services end after the runner has asked them.
 const SPARE: Duration = Duration::from_secs(600);
 
-/// Plays a scenario and gives what was measured; whether that is as expected is for [`Report::check`].
+/// Plays a scenario and gives what was measured; whether that is as expected is for
+/// [`Report::check`].
 ///
 /// # Errors
 /// When the machine does not allow it, something does not start, or a route does not come up.
@@ -40,7 +43,8 @@ enum Server {
     Kafka(KafkaServer),
 }
 
-/// The processes of a scenario, for tests that break and measure things themselves. They end when it is dropped.
+/// The processes of a scenario, for tests that break and measure things themselves. They end when
+/// it is dropped.
 pub struct Running {
     // Fields are dropped in this order.
     publishers: Vec<Probe>,
@@ -127,10 +131,7 @@ impl Running {
         option("--node", flow.spec.node.clone());
         option("--service", service.name.to_owned());
         option("--duration", time.as_secs().to_string());
-        service
-            .streams
-            .iter()
-            .for_each(|stream| option("--topic", words(stream)));
+        service.streams.iter().for_each(|stream| option("--topic", words(stream)));
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let process = Process::tool("probe", &arguments, Some(&host.namespace))?;
         let ready = format!("ready node={} ", service.flow);
@@ -140,10 +141,7 @@ impl Running {
             || process.stderr().iter().any(|line| line.starts_with(&ready)),
             || process.tail(),
         )?;
-        Ok(Probe {
-            service: service.clone(),
-            process,
-        })
+        Ok(Probe { service: service.clone(), process })
     }
 
     /// Waits until every topic has reached every consumer that wants it.
@@ -208,8 +206,7 @@ impl Running {
                 usage = Some(self.warm_usage(begin + scenario.duration / WARM)?);
             }
             sleep_until(begin + *at);
-            self.break_or_mend(fault)
-                .with_context(|| format!("{fault:?} at {at:?}"))?;
+            self.break_or_mend(fault).with_context(|| format!("{fault:?} at {at:?}"))?;
         }
         let usage = match usage {
             Some(usage) => usage,
@@ -232,7 +229,9 @@ impl Running {
             let sent = &sent;
             let from = rows.0.get(probe.service.name).copied().unwrap_or(0);
             let streams = probe.service.streams.iter();
-            streams.map(move |stream| probe.route(stream.topic, sent.get(stream.topic).copied().unwrap_or(0), from))
+            streams.map(move |stream| {
+                probe.route(stream.topic, sent.get(stream.topic).copied().unwrap_or(0), from)
+            })
         });
         Ok(Report {
             name: scenario.name.to_owned(),
@@ -242,22 +241,29 @@ impl Running {
         })
     }
 
-    /// What the flows hold once they are warm; one that was killed just then is compared with what it begins with.
+    /// What the flows hold once they are warm; one that was killed just then is compared with what
+    /// it begins with.
     fn warm_usage(&self, at: Instant) -> anyhow::Result<BTreeMap<&'static str, Usage>> {
         sleep_until(at);
-        let usage = self
-            .flows
-            .iter()
-            .map(|(node, flow)| Ok((*node, flow.usage().unwrap_or_default())));
+        let usage =
+            self.flows.iter().map(|(node, flow)| Ok((*node, flow.usage().unwrap_or_default())));
         usage.collect()
     }
 
-    fn flow_reports(&mut self, warm: &BTreeMap<&'static str, Usage>) -> anyhow::Result<Vec<FlowReport>> {
+    fn flow_reports(
+        &mut self,
+        warm: &BTreeMap<&'static str, Usage>,
+    ) -> anyhow::Result<Vec<FlowReport>> {
         let mut reports = Vec::new();
         for (node, flow) in &mut self.flows {
             flow.wait_ready()?;
             // Messages may be on their way from one bridge to the next until the last has settled.
-            let _ = wait::until("bridges have settled", ROW, || unbalanced(flow).is_empty(), String::new);
+            let _ = wait::until(
+                "bridges have settled",
+                ROW,
+                || unbalanced(flow).is_empty(),
+                String::new,
+            );
             reports.push(FlowReport {
                 node: (*node).to_owned(),
                 warm: warm.get(node).copied().unwrap_or_default(),
@@ -341,12 +347,10 @@ impl Running {
     /// The last lines of all processes.
     #[must_use]
     pub fn tails(&self) -> String {
-        let flows = self
-            .flows
-            .iter()
-            .map(|(node, flow)| format!("--- {node}\n{}", flow.tail()));
+        let flows = self.flows.iter().map(|(node, flow)| format!("--- {node}\n{}", flow.tail()));
         let probes = self.publishers.iter().chain(&self.consumers);
-        let probes = probes.map(|probe| format!("--- {}\n{}", probe.service.name, probe.process.tail()));
+        let probes =
+            probes.map(|probe| format!("--- {}\n{}", probe.service.name, probe.process.tail()));
         flows.chain(probes).collect::<Vec<_>>().join("\n")
     }
 }
@@ -358,8 +362,7 @@ impl Probe {
 
     /// A number of a topic in the last row; 0 where it is absent.
     fn last(&self, topic: &str, field: &str) -> u64 {
-        self.last_row()
-            .map_or(0, |row| of_topic(&row, topic)[field].as_u64().unwrap_or(0))
+        self.last_row().map_or(0, |row| of_topic(&row, topic)[field].as_u64().unwrap_or(0))
     }
 
     fn route(&self, topic: &str, sent: u64, from_row: usize) -> Route {
@@ -402,10 +405,7 @@ fn unbalanced(flow: &FlowProcess) -> Vec<String> {
             number(&bridge["queued"]),
         );
         (came != went + dropped + waits).then(|| {
-            format!(
-                "{}: in {came}, out {went}, dropped {dropped}, queued {waits}",
-                bridge["id"]
-            )
+            format!("{}: in {came}, out {went}, dropped {dropped}, queued {waits}", bridge["id"])
         })
     };
     flow.bridges().iter().filter_map(of).collect()
@@ -425,19 +425,13 @@ fn dropped(flow: &FlowProcess) -> BTreeMap<String, u64> {
 fn start_broker(broker: &Broker, host: &Host) -> anyhow::Result<Server> {
     let host = Some(host.clone());
     let server = match broker.kind {
-        BrokerKind::Redis => RedisServer::start(
-            RedisKind::Redis,
-            RedisOptions {
-                host,
-                ..RedisOptions::default()
-            },
-        )
-        .map(Server::Redis),
-        BrokerKind::Kafka => KafkaServer::start(KafkaOptions {
-            host,
-            ..KafkaOptions::default()
-        })
-        .map(Server::Kafka),
+        BrokerKind::Redis => {
+            RedisServer::start(RedisKind::Redis, RedisOptions { host, ..RedisOptions::default() })
+                .map(Server::Redis)
+        }
+        BrokerKind::Kafka => {
+            KafkaServer::start(KafkaOptions { host, ..KafkaOptions::default() }).map(Server::Kafka)
+        }
     };
     server.with_context(|| broker.name)
 }
@@ -445,24 +439,14 @@ fn start_broker(broker: &Broker, host: &Host) -> anyhow::Result<Server> {
 /// As `blaze-probe --topic` wants it.
 fn words(stream: &Stream) -> String {
     let reliability = if stream.reliable { "reliable" } else { "best_effort" };
-    let Stream {
-        topic,
-        hz,
-        bytes,
-        lifespan,
-        payloads,
-        reliable: _,
-    } = stream;
+    let Stream { topic, hz, bytes, lifespan, payloads, reliable: _ } = stream;
     let file = payloads.map(|file| format!(",@{file}")).unwrap_or_default();
     format!("{topic},{reliability},{hz},{bytes},{}{file}", lifespan.as_millis())
 }
 
 fn of_topic<'a>(row: &'a Value, topic: &str) -> &'a Value {
     let topics = row["topics"].as_array().map(Vec::as_slice).unwrap_or_default();
-    topics
-        .iter()
-        .find(|line| line["topic"] == topic)
-        .unwrap_or(&Value::Null)
+    topics.iter().find(|line| line["topic"] == topic).unwrap_or(&Value::Null)
 }
 
 fn sleep_until(at: Instant) {

@@ -1,8 +1,11 @@
-//! An authority with certificates for 127.0.0.1 and for a client, made anew for each server with TLS.
+//! An authority with certificates for 127.0.0.1 and for a client, made anew for each server with
+//! TLS.
 
 use std::path::{Path, PathBuf};
 
-use rcgen::{BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair};
+use rcgen::{
+    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
+};
 
 /// Files in PEM form.
 #[derive(Debug, Clone)]
@@ -28,9 +31,7 @@ impl Certificates {
         let authority_key = KeyPair::generate()?;
         let mut authority = CertificateParams::new(Vec::new())?;
         authority.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-        authority
-            .distinguished_name
-            .push(DnType::CommonName, "Authority of one test");
+        authority.distinguished_name.push(DnType::CommonName, "Authority of one test");
         let authority_pem = authority.self_signed(&authority_key)?.pem();
         let issuer = Issuer::new(authority, authority_key);
 
@@ -48,7 +49,8 @@ impl Certificates {
             ExtendedKeyUsagePurpose::ServerAuth,
             "Server of one test",
         )?;
-        let (client, client_key) = signed(&[], ExtendedKeyUsagePurpose::ClientAuth, "Client of one test")?;
+        let (client, client_key) =
+            signed(&[], ExtendedKeyUsagePurpose::ClientAuth, "Client of one test")?;
 
         let files = Self {
             authority: folder.join("authority.pem"),

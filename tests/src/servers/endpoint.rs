@@ -15,10 +15,7 @@ pub(super) struct Endpoint {
 
 impl Endpoint {
     pub(super) fn new(host: Option<&Host>, port: u16) -> Self {
-        Self {
-            host: host.cloned(),
-            port,
-        }
+        Self { host: host.cloned(), port }
     }
 
     pub(super) fn loopback(port: u16) -> Self {
@@ -39,7 +36,10 @@ impl Endpoint {
     }
 
     /// Does something where the server is.
-    pub(super) fn inside<T: Send>(&self, act: impl FnOnce() -> anyhow::Result<T> + Send) -> anyhow::Result<T> {
+    pub(super) fn inside<T: Send>(
+        &self,
+        act: impl FnOnce() -> anyhow::Result<T> + Send,
+    ) -> anyhow::Result<T> {
         match self.namespace() {
             None => act(),
             Some(namespace) => network::inside(namespace, act),

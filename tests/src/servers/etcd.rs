@@ -1,4 +1,5 @@
-//! An etcd of one test or measurement: a cluster of one member, which syncs every write to the disk, as it does by default.
+//! An etcd of one test or measurement: a cluster of one member, which syncs every write to the
+//! disk, as it does by default.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -81,10 +82,7 @@ impl EtcdServer {
             .args(&self.options.extra);
         self.process.spawn(command)?;
         // The log tells that it has the port: another server there would answer as well.
-        let admin = Admin {
-            address: self.address(),
-            namespace: None,
-        };
+        let admin = Admin { address: self.address(), namespace: None };
         let is_healthy = || admin.json("/health").is_ok_and(|answer| answer["health"] == "true");
         let ready = || self.process.has_logged(LISTENS) && is_healthy();
         self.process.wait_ready(START, ready)?;

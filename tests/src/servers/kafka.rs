@@ -20,11 +20,10 @@ const LOOK: Duration = Duration::from_secs(1);
 /// Another process may take a port between our choice and the broker's start.
 const PORT_ATTEMPTS: usize = 3;
 
-const PROPERTIES: &str = include_str!(concat!(
-    env!("CARGO_MANIFEST_DIR"),
-    "/../scripts/services.d/kafka.properties"
-));
-const JAVA_OPTIONS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../scripts/services.d/kafka.java-options");
+const PROPERTIES: &str =
+    include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/../scripts/services.d/kafka.properties"));
+const JAVA_OPTIONS: &str =
+    concat!(env!("CARGO_MANIFEST_DIR"), "/../scripts/services.d/kafka.java-options");
 const LOGGING: &str = include_str!(concat!(
     env!("CARGO_MANIFEST_DIR"),
     "/../scripts/services.d/kafka.log4j2.properties"
@@ -43,16 +42,12 @@ pub struct KafkaOptions {
 
 impl Default for KafkaOptions {
     fn default() -> Self {
-        Self {
-            heap_mib: 512,
-            host: None,
-            extra: Vec::new(),
-        }
+        Self { heap_mib: 512, host: None, extra: Vec::new() }
     }
 }
 
-/// A running broker, which is its own controller; killed when dropped. The first consumer group takes some seconds more,
-/// because its offsets' topic is made then.
+/// A running broker, which is its own controller; killed when dropped. The first consumer group
+/// takes some seconds more, because its offsets' topic is made then.
 pub struct KafkaServer {
     process: ServerProcess,
     options: KafkaOptions,
@@ -104,21 +99,14 @@ impl KafkaServer {
         }
         std::fs::write(folder.join("server.properties"), text)?;
         std::fs::write(folder.join("log4j2.properties"), LOGGING)?;
-        Ok(Self {
-            process,
-            options,
-            endpoint,
-            cluster,
-        })
+        Ok(Self { process, options, endpoint, cluster })
     }
 
     fn spawn(&self) -> anyhow::Result<()> {
         let mut command = self.endpoint.program(installed::path("jre/bin/java")?);
         // Java itself expands the asterisk.
         let libraries = installed::path("kafka/libs")?.join("*");
-        command
-            .arg(format!("@{JAVA_OPTIONS}"))
-            .arg(format!("-Xmx{}m", self.options.heap_mib));
+        command.arg(format!("@{JAVA_OPTIONS}")).arg(format!("-Xmx{}m", self.options.heap_mib));
         // Half the time to start. Java does without if the archive does not fit.
         let archive = installed::folder().join("kafka/classes.jsa");
         if archive.exists() {
@@ -144,7 +132,9 @@ impl KafkaServer {
         // The cluster tells that it has the port: another broker there would answer as well.
         let ready = || {
             let leaders = leaders(&self.endpoint, LOOK);
-            leaders.is_ok_and(|(cluster, leaders)| cluster == self.cluster && leaders.iter().all(|leader| *leader >= 0))
+            leaders.is_ok_and(|(cluster, leaders)| {
+                cluster == self.cluster && leaders.iter().all(|leader| *leader >= 0)
+            })
         };
         self.process.wait_ready(START, ready)?;
         Ok(())
@@ -175,7 +165,8 @@ impl KafkaServer {
         self.process.freeze()
     }
 
-    /// SIGCONT after [`KafkaServer::freeze`]. The broker may need seconds to take itself for alive again.
+    /// SIGCONT after [`KafkaServer::freeze`]. The broker may need seconds to take itself for alive
+    /// again.
     ///
     /// # Errors
     /// When it does not run.
@@ -184,8 +175,8 @@ impl KafkaServer {
     }
 }
 
-/// Copies the empty data folder that `scripts/services install` formatted, which saves a start of Java, and gives it a
-/// cluster identity of its own.
+/// Copies the empty data folder that `scripts/services install` formatted, which saves a start of
+/// Java, and gives it a cluster identity of its own.
 fn copy_formatted(from: &Path, to: &Path, cluster: &str) -> anyhow::Result<()> {
     std::fs::create_dir(to)?;
     for entry in std::fs::read_dir(from)? {
@@ -193,7 +184,8 @@ fn copy_formatted(from: &Path, to: &Path, cluster: &str) -> anyhow::Result<()> {
         std::fs::copy(entry.path(), to.join(entry.file_name()))?;
     }
     let path = to.join("meta.properties");
-    let text = std::fs::read_to_string(&path).context("kafka/formatted is not a formatted data folder")?;
+    let text =
+        std::fs::read_to_string(&path).context("kafka/formatted is not a formatted data folder")?;
     std::fs::write(path, with_cluster_id(&text, cluster))?;
     Ok(())
 }
@@ -213,14 +205,16 @@ fn new_cluster_id() -> String {
     format!("{:0>22}", &name[start..])
 }
 
-/// The cluster that a broker belongs to, and the leaders of all partitions; −1 where there is none, and writing fails for now.
+/// The cluster that a broker belongs to, and the leaders of all partitions; −1 where there is none,
+/// and writing fails for now.
 ///
 /// # Errors
 /// When no broker answers in time.
 pub(super) fn leaders(broker: &Endpoint, within: Duration) -> anyhow::Result<(String, Vec<i32>)> {
     broker.inside(|| {
         let mut settings = ClientConfig::new();
-        let settings = settings.set("bootstrap.servers", format!("{}:{}", broker.ip(), broker.port));
+        let settings =
+            settings.set("bootstrap.servers", format!("{}:{}", broker.ip(), broker.port));
         let client: BaseConsumer = settings.set("log_level", "2").create()?;
         let metadata = client.fetch_metadata(None, within)?;
         anyhow::ensure!(!metadata.brokers().is_empty(), "no broker takes part");

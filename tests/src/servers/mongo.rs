@@ -29,11 +29,16 @@ pub fn drop_mongo_database(uri: &str, database: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Runs a command, given in extended JSON, on a server of this machine; for what no client of the product does.
+/// Runs a command, given in extended JSON, on a server of this machine; for what no client of the
+/// product does.
 ///
 /// # Errors
 /// When the server does not answer or refuses.
-pub fn mongo_command(uri: &str, database: &str, command: &serde_json::Value) -> anyhow::Result<bson::Document> {
+pub fn mongo_command(
+    uri: &str,
+    database: &str,
+    command: &serde_json::Value,
+) -> anyhow::Result<bson::Document> {
     let (server, document) = for_wire(uri, database, command)?;
     let answer = mongo_wire::command(&server, &document)?;
     anyhow::ensure!(
@@ -43,8 +48,8 @@ pub fn mongo_command(uri: &str, database: &str, command: &serde_json::Value) -> 
     Ok(answer)
 }
 
-/// Leaves a transaction open as a process does that is killed within it: begins it as a client called `app_name`, does
-/// one command, and goes.
+/// Leaves a transaction open as a process does that is killed within it: begins it as a client
+/// called `app_name`, does one command, and goes.
 ///
 /// # Errors
 /// As [`mongo_command`].
@@ -58,7 +63,11 @@ pub fn abandon_mongo_transaction(
     mongo_wire::abandon(&server, app_name, document)
 }
 
-fn for_wire(uri: &str, database: &str, command: &serde_json::Value) -> anyhow::Result<(Endpoint, bson::Document)> {
+fn for_wire(
+    uri: &str,
+    database: &str,
+    command: &serde_json::Value,
+) -> anyhow::Result<(Endpoint, bson::Document)> {
     let port = loopback_port(uri).with_context(|| format!("{uri} is no server of this machine"))?;
     let mut document = bson::Document::new();
     for (name, value) in command.as_object().context("a command is an object")? {
@@ -72,12 +81,13 @@ fn for_wire(uri: &str, database: &str, command: &serde_json::Value) -> anyhow::R
 ///
 /// # Errors
 /// As [`mongo_command`].
-pub fn mongo_insert(uri: &str, database: &str, table: &str, document: &serde_json::Value) -> anyhow::Result<()> {
-    mongo_command(
-        uri,
-        database,
-        &serde_json::json!({ "insert": table, "documents": [document] }),
-    )?;
+pub fn mongo_insert(
+    uri: &str,
+    database: &str,
+    table: &str,
+    document: &serde_json::Value,
+) -> anyhow::Result<()> {
+    mongo_command(uri, database, &serde_json::json!({ "insert": table, "documents": [document] }))?;
     Ok(())
 }
 
@@ -96,8 +106,9 @@ pub struct MongoOptions {
     pub host: Option<Host>,
     /// A server that is alone: it has neither transactions nor change streams.
     pub alone: bool,
-    /// Where its folder is made; absent = among temporary files. For measurements, where the disk matters; it has room then
-    /// like a server that is used, and not the least that tests can do with.
+    /// Where its folder is made; absent = among temporary files. For measurements, where the disk
+    /// matters; it has room then like a server that is used, and not the least that tests can do
+    /// with.
     pub folder: Option<PathBuf>,
     /// Further arguments of `mongod`.
     pub extra: Vec<String>,
@@ -122,11 +133,7 @@ impl MongoServer {
     pub fn start(options: MongoOptions) -> anyhow::Result<Self> {
         let mut attempt = 1;
         loop {
-            let port = if options.port == 0 {
-                ports::free()?
-            } else {
-                options.port
-            };
+            let port = if options.port == 0 { ports::free()? } else { options.port };
             let process = ServerProcess::new_in("mongo", options.folder.as_deref())?;
             std::fs::create_dir(process.folder().join("data"))?;
             let server = Self {
@@ -205,7 +212,8 @@ impl MongoServer {
         mongo_wire::is_writable(&self.endpoint)
     }
 
-    /// SIGKILL; its end has been waited for. What was acknowledged stays for [`MongoServer::restart`].
+    /// SIGKILL; its end has been waited for. What was acknowledged stays for
+    /// [`MongoServer::restart`].
     ///
     /// # Errors
     /// When the system refuses.

@@ -1,6 +1,8 @@
-//! Just enough of MongoDB's protocol to ask a server whether it can be used, and to make it a replica set of one.
+//! Just enough of MongoDB's protocol to ask a server whether it can be used, and to make it a
+//! replica set of one.
 //!
-//! The driver would do as well, but it is asynchronous, and its server selection hides when the server came back.
+//! The driver would do as well, but it is asynchronous, and its server selection hides when the
+//! server came back.
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -21,10 +23,8 @@ const ALREADY_INITIALIZED: i32 = 23;
 /// # Errors
 /// When there is no answer within two seconds, or one that is not MongoDB's.
 pub(super) fn pid(server: &Endpoint) -> anyhow::Result<i64> {
-    let answer = command(
-        server,
-        &doc! { "serverStatus": 1, "repl": 0, "metrics": 0, "$db": "admin" },
-    )?;
+    let answer =
+        command(server, &doc! { "serverStatus": 1, "repl": 0, "metrics": 0, "$db": "admin" })?;
     match answer.get("pid") {
         Some(bson::Bson::Int64(pid)) => Ok(*pid),
         Some(bson::Bson::Int32(pid)) => Ok(i64::from(*pid)),
@@ -40,7 +40,8 @@ pub(super) fn initiate(server: &Endpoint) -> anyhow::Result<()> {
     let member = doc! { "_id": 0, "host": format!("{}:{}", server.ip(), server.port) };
     let set = doc! { "_id": "rs0", "members": [member] };
     let answer = command(server, &doc! { "replSetInitiate": set, "$db": "admin" })?;
-    let done = is_ok(&answer) || answer.get_i32("code").is_ok_and(|code| code == ALREADY_INITIALIZED);
+    let done =
+        is_ok(&answer) || answer.get_i32("code").is_ok_and(|code| code == ALREADY_INITIALIZED);
     anyhow::ensure!(done, "replSetInitiate: {answer}");
     Ok(())
 }
@@ -64,25 +65,27 @@ pub(super) fn command(server: &Endpoint, command: &Document) -> anyhow::Result<D
     exchange(&mut connect(server)?, command)
 }
 
-/// Begins a transaction as the client that the driver calls by a name, does one command in it, and goes without a word:
-/// what a process leaves that is killed.
+/// Begins a transaction as the client that the driver calls by a name, does one command in it, and
+/// goes without a word: what a process leaves that is killed.
 ///
 /// # Errors
 /// As [`pid`], and when the server refuses.
-pub(super) fn abandon(server: &Endpoint, app_name: &str, mut command: Document) -> anyhow::Result<()> {
+pub(super) fn abandon(
+    server: &Endpoint,
+    app_name: &str,
+    mut command: Document,
+) -> anyhow::Result<()> {
     let mut stream = connect(server)?;
     let parts = doc! { "name": "blaze-tests", "version": "1" };
-    let client = doc! { "application": { "name": app_name }, "driver": parts, "os": { "type": "any" } };
+    let client =
+        doc! { "application": { "name": app_name }, "driver": parts, "os": { "type": "any" } };
     exchange(&mut stream, &doc! { "hello": 1, "client": client, "$db": "admin" })?;
     command.insert("lsid", doc! { "id": bson::Uuid::new() });
     command.insert("txnNumber", 1_i64);
     command.insert("startTransaction", true);
     command.insert("autocommit", false);
     let answer = exchange(&mut stream, &command)?;
-    anyhow::ensure!(
-        is_ok(&answer) && !answer.contains_key("writeErrors"),
-        "{command}: {answer}"
-    );
+    anyhow::ensure!(is_ok(&answer) && !answer.contains_key("writeErrors"), "{command}: {answer}");
     Ok(())
 }
 

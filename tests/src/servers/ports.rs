@@ -3,13 +3,13 @@
 use std::net::{Ipv4Addr, TcpListener};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// Below the range that Linux gives to outgoing connections: a client that retries while its server is down can neither
-/// take the server's port nor, on loopback, connect to itself.
+/// Below the range that Linux gives to outgoing connections: a client that retries while its server
+/// is down can neither take the server's port nor, on loopback, connect to itself.
 const FIRST: u32 = 20_000;
 const COUNT: u32 = 12_000;
 
-/// A port on which nobody listens now. Two processes that ask at the same time start at different places; who takes the
-/// port must be ready to find it taken.
+/// A port on which nobody listens now. Two processes that ask at the same time start at different
+/// places; who takes the port must be ready to find it taken.
 ///
 /// # Errors
 /// When none of the ports from 20000 to 31999 is free.

@@ -16,7 +16,8 @@ use crate::guard;
 /// Lines of the log that go into an error.
 const LOG_LINES: usize = 20;
 
-/// A server with a folder of its own. It can be started again after its end, in the same folder. Killed when dropped.
+/// A server with a folder of its own. It can be started again after its end, in the same folder.
+/// Killed when dropped.
 pub(super) struct ServerProcess {
     name: &'static str,
     folder: TempDir,
@@ -77,10 +78,7 @@ impl ServerProcess {
             .process_group(0);
         let started = command.spawn().with_context(|| format!("starting {}", self.name))?;
         let pid = started.id();
-        *child = Some(Running {
-            child: started,
-            log_start,
-        });
+        *child = Some(Running { child: started, log_start });
         guard::add(pid, self.folder())
     }
 
@@ -88,7 +86,11 @@ impl ServerProcess {
     ///
     /// # Errors
     /// When the deadline passes or the process ends; with the last lines of its log.
-    pub(super) fn wait_ready(&self, deadline: Duration, mut answers: impl FnMut() -> bool) -> anyhow::Result<Duration> {
+    pub(super) fn wait_ready(
+        &self,
+        deadline: Duration,
+        mut answers: impl FnMut() -> bool,
+    ) -> anyhow::Result<Duration> {
         let start = Instant::now();
         loop {
             if answers() {
@@ -154,11 +156,10 @@ impl ServerProcess {
     }
 
     fn signal(&self, signal: Signal) -> anyhow::Result<()> {
-        // The lock is held so that the process cannot be reaped, and its number given away, in between.
+        // The lock is held so that the process cannot be reaped, and its number given away, in
+        // between.
         let running = self.child.lock();
-        let running = running
-            .as_ref()
-            .with_context(|| format!("{} does not run", self.name))?;
+        let running = running.as_ref().with_context(|| format!("{} does not run", self.name))?;
         let pid = Pid::from_raw(i32::try_from(running.child.id())?).context("no process id")?;
         kill_process(pid, signal).with_context(|| format!("{signal:?} to {}", self.name))
     }
@@ -183,9 +184,7 @@ impl ServerProcess {
         let status = std::fs::read_to_string(format!("/proc/{pid}/status"))?;
         let line = status.lines().find(|line| line.starts_with("VmRSS:"));
         let number = line.and_then(|line| line.split_whitespace().nth(1));
-        Ok(number
-            .with_context(|| format!("{} has no memory", self.name))?
-            .parse()?)
+        Ok(number.with_context(|| format!("{} has no memory", self.name))?.parse()?)
     }
 
     fn log_path(&self) -> PathBuf {
@@ -216,7 +215,8 @@ impl Drop for ServerProcess {
     }
 }
 
-/// Runs a command to its end, or kills it at the deadline: a client must not wait for ever for a frozen server.
+/// Runs a command to its end, or kills it at the deadline: a client must not wait for ever for a
+/// frozen server.
 ///
 /// # Errors
 /// When it does not start or does not end in time.

@@ -57,7 +57,8 @@ pub struct RedisOptions {
     pub tls: bool,
     /// Users as in `ACL SETUSER`: `edge on >pw ~b:* &b:* +@all -@dangerous`.
     pub acl: Vec<String>,
-    /// Lines of `redis.conf`; they win over the harness's own. Nothing is kept on disk unless a line asks for it.
+    /// Lines of `redis.conf`; they win over the harness's own. Nothing is kept on disk unless a
+    /// line asks for it.
     pub extra: Vec<String>,
 }
 
@@ -94,11 +95,7 @@ impl RedisServer {
         );
         let mut attempt = 1;
         loop {
-            let port = if options.port == 0 {
-                ports::free()?
-            } else {
-                options.port
-            };
+            let port = if options.port == 0 { ports::free()? } else { options.port };
             let server = Self::prepare(kind, port, &options)?;
             match server.spawn() {
                 Ok(()) => return Ok(server),
@@ -122,12 +119,7 @@ impl RedisServer {
         let endpoint = Endpoint::new(options.host.as_ref(), port);
         let text = configuration(process.folder(), &endpoint, certificates.as_ref(), options)?;
         std::fs::write(process.folder().join("redis.conf"), text)?;
-        Ok(Self {
-            kind,
-            process,
-            endpoint,
-            certificates,
-        })
+        Ok(Self { kind, process, endpoint, certificates })
     }
 
     fn spawn(&self) -> anyhow::Result<()> {
@@ -153,7 +145,8 @@ impl RedisServer {
         self.endpoint.port
     }
 
-    /// File with the certificate of the authority that signed the server's, in PEM form; `None` without TLS.
+    /// File with the certificate of the authority that signed the server's, in PEM form; `None`
+    /// without TLS.
     #[must_use]
     pub fn authority(&self) -> Option<&Path> {
         self.certificates.as_ref().map(|files| files.authority.as_path())
@@ -167,8 +160,8 @@ impl RedisServer {
         self.process.kill()
     }
 
-    /// Kills it if it runs, starts it on the same port and folder, and waits until it answers. Data is there again only if
-    /// [`RedisOptions::extra`] asked for it.
+    /// Kills it if it runs, starts it on the same port and folder, and waits until it answers. Data
+    /// is there again only if [`RedisOptions::extra`] asked for it.
     ///
     /// # Errors
     /// As [`RedisServer::start`].
@@ -193,7 +186,8 @@ impl RedisServer {
         self.process.thaw()
     }
 
-    /// Whether it answers `PING` within half a second. A refusal for want of rights is an answer, too.
+    /// Whether it answers `PING` within half a second. A refusal for want of rights is an answer,
+    /// too.
     #[must_use]
     pub fn ping(&self) -> bool {
         match &self.certificates {
@@ -205,7 +199,8 @@ impl RedisServer {
         }
     }
 
-    /// What `redis-cli` prints for a command, as the default user; name another with `--user` and `--pass` in front.
+    /// What `redis-cli` prints for a command, as the default user; name another with `--user` and
+    /// `--pass` in front.
     ///
     /// # Errors
     /// When the server refuses the command, or does not answer within ten seconds.
@@ -246,11 +241,7 @@ fn configuration(
             writeln!(text, "tls-key-file {}", files.key.display())?;
         }
     }
-    writeln!(
-        text,
-        "bind {ip}\nprotected-mode no\ndir {}\nloglevel notice",
-        folder.display()
-    )?;
+    writeln!(text, "bind {ip}\nprotected-mode no\ndir {}\nloglevel notice", folder.display())?;
     writeln!(text, "save \"\"\nappendonly no\nappendfsync always")?;
     // Large messages to a slow reader: the default of 32 MiB cuts it off.
     writeln!(text, "client-output-buffer-limit pubsub 256mb 128mb 60")?;

@@ -1,15 +1,16 @@
 //! The servers that all tests of a run share.
 //!
-//! Where they are, in this order: the environment variable, the line of the same name in `.services/env`, a server that
-//! this process starts for itself. An address that is named but does not answer is an error, never passed over.
+//! Where they are, in this order: the environment variable, the line of the same name in
+//! `.services/env`, a server that this process starts for itself. An address that is named but does
+//! not answer is an error, never passed over.
 
 use std::sync::OnceLock;
 use std::time::Duration;
 
 use super::endpoint::Endpoint;
 use super::{
-    KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer, installed, kafka,
-    mongo, mongo_wire, redis,
+    KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer,
+    installed, kafka, mongo, mongo_wire, redis,
 };
 
 /// How long a server may take to answer on a busy machine.
@@ -17,7 +18,8 @@ const BUSY: Duration = Duration::from_secs(10);
 
 type Once<T> = OnceLock<Result<T, String>>;
 
-/// `redis://…` of the Redis that all tests share. Use names from [`super::unique_name`]; never `FLUSHALL`.
+/// `redis://…` of the Redis that all tests share. Use names from [`super::unique_name`]; never
+/// `FLUSHALL`.
 ///
 /// # Errors
 /// When the named server does not answer, or none can be started.
@@ -35,8 +37,8 @@ pub fn shared_valkey() -> anyhow::Result<String> {
     redis_at("BLAZE_TEST_VALKEY_URL", RedisKind::Valkey, &OWN)
 }
 
-/// `HOST:PORT` of the fog layer's Kafka that all tests share. Topics are not made by themselves. Use names from
-/// [`super::unique_name`].
+/// `HOST:PORT` of the fog layer's Kafka that all tests share. Topics are not made by themselves.
+/// Use names from [`super::unique_name`].
 ///
 /// # Errors
 /// As [`shared_redis`].
@@ -54,7 +56,8 @@ pub fn shared_kafka_cloud() -> anyhow::Result<String> {
     kafka_at("BLAZE_TEST_KAFKA_CLOUD", &OWN)
 }
 
-/// `mongodb://…` of the MongoDB replica set that all tests share. Use databases of names from [`super::unique_name`].
+/// `mongodb://…` of the MongoDB replica set that all tests share. Use databases of names from
+/// [`super::unique_name`].
 ///
 /// # Errors
 /// As [`shared_redis`].
@@ -64,22 +67,30 @@ pub fn shared_mongo() -> anyhow::Result<String> {
     let Some(uri) = address(name) else {
         return Ok(started(&OWN, || MongoServer::start(MongoOptions::default()))?.uri());
     };
-    // An address of one's own may hold a password, TLS or several hosts: then the test itself finds out.
-    let answers = mongo::loopback_port(&uri).is_none_or(|port| mongo_wire::is_writable(&Endpoint::loopback(port)));
+    // An address of one's own may hold a password, TLS or several hosts: then the test itself finds
+    // out.
+    let answers = mongo::loopback_port(&uri)
+        .is_none_or(|port| mongo_wire::is_writable(&Endpoint::loopback(port)));
     anyhow::ensure!(answers, "{}", silent(name, &uri));
     Ok(uri)
 }
 
-fn redis_at(name: &str, kind: RedisKind, own: &'static Once<RedisServer>) -> anyhow::Result<String> {
+fn redis_at(
+    name: &str,
+    kind: RedisKind,
+    own: &'static Once<RedisServer>,
+) -> anyhow::Result<String> {
     let Some(url) = address(name) else {
         return Ok(started(own, || RedisServer::start(kind, RedisOptions::default()))?.url());
     };
-    // An address of one's own may hold a password, TLS or another host: then the test itself finds out.
+    // An address of one's own may hold a password, TLS or another host: then the test itself finds
+    // out.
     let port = url
         .strip_prefix("redis://127.0.0.1:")
         .and_then(|port| port.trim_end_matches('/').parse().ok());
-    let answers =
-        port.is_none_or(|port| redis::ping(&Endpoint::loopback(port)).is_some_and(|answer| redis::is_ready(&answer)));
+    let answers = port.is_none_or(|port| {
+        redis::ping(&Endpoint::loopback(port)).is_some_and(|answer| redis::is_ready(&answer))
+    });
     anyhow::ensure!(answers, "{}", silent(name, &url));
     Ok(url)
 }
@@ -94,7 +105,8 @@ fn kafka_at(name: &str, own: &'static Once<KafkaServer>) -> anyhow::Result<Strin
     Ok(address)
 }
 
-/// The address that a variable (`BLAZE_TEST_REDIS_URL`, …) or else `.services/env` names; nothing is asked or started.
+/// The address that a variable (`BLAZE_TEST_REDIS_URL`, …) or else `.services/env` names; nothing
+/// is asked or started.
 #[must_use]
 pub fn address(name: &str) -> Option<String> {
     std::env::var_os(name)
@@ -105,12 +117,16 @@ pub fn address(name: &str) -> Option<String> {
 
 fn silent(name: &str, address: &str) -> String {
     format!(
-        "{name}={address} does not answer: run `scripts/services start`, or `scripts/services stop` to let each test \
+        "{name}={address} does not answer: run `scripts/services start`, or `scripts/services \
+         stop` to let each test \
          process start its own"
     )
 }
 
-fn started<T>(own: &'static Once<T>, start: impl FnOnce() -> anyhow::Result<T>) -> anyhow::Result<&'static T> {
+fn started<T>(
+    own: &'static Once<T>,
+    start: impl FnOnce() -> anyhow::Result<T>,
+) -> anyhow::Result<&'static T> {
     own.get_or_init(|| start().map_err(|error| format!("{error:#}")))
         .as_ref()
         .map_err(|error| anyhow::anyhow!("{error}"))

@@ -1,5 +1,6 @@
-//! A reader of one topic of a DDS domain in a process of its own, which tests kill or hold still: either with the product's
-//! adapter, or as a plain DDS program that knows nothing but `brokers/idl/blaze_frame.idl`.
+//! A reader of one topic of a DDS domain in a process of its own, which tests kill or hold still:
+//! either with the product's adapter, or as a plain DDS program that knows nothing but
+//! `brokers/idl/blaze_frame.idl`.
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
@@ -19,8 +20,9 @@ use serde::{Deserialize, Serialize};
 
 /// Between two lines of output.
 const REPORT: Duration = Duration::from_millis(100);
-/// Samples that a plain reader keeps until they are taken: older ones give way, also reliable ones, so it is as many as
-/// a writer keeps. On a busy machine 512 of them, sent 2,000 times a second, are not enough.
+/// Samples that a plain reader keeps until they are taken: older ones give way, also reliable ones,
+/// so it is as many as a writer keeps. On a busy machine 512 of them, sent 2,000 times a second,
+/// are not enough.
 const DEPTH: i32 = 8192;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -121,10 +123,7 @@ async fn adapter(options: &Options, seen: &Mutex<Seen>) -> anyhow::Result<()> {
         interface: Ipv4Addr::LOCALHOST,
     })?;
     broker.status().wait_for(|status| status.health == Health::Up).await?;
-    let subscribe = SubscribeOptions {
-        large: options.large,
-        ..SubscribeOptions::default()
-    };
+    let subscribe = SubscribeOptions { large: options.large, ..SubscribeOptions::default() };
     let mut subscription = broker.subscribe(&options.topic, subscribe).await?;
     let mut batch = Vec::new();
     while subscription.receive(&mut batch, 64).await > 0 {
@@ -138,9 +137,7 @@ async fn adapter(options: &Options, seen: &Mutex<Seen>) -> anyhow::Result<()> {
 
 fn plain(options: &Options, seen: &Mutex<Seen>) -> anyhow::Result<()> {
     let reliability = if options.reliable {
-        Reliability::Reliable {
-            max_blocking_time: rustdds::Duration::ZERO,
-        }
+        Reliability::Reliable { max_blocking_time: rustdds::Duration::ZERO }
     } else {
         Reliability::BestEffort
     };
@@ -161,7 +158,8 @@ fn plain(options: &Options, seen: &Mutex<Seen>) -> anyhow::Result<()> {
     } else {
         format!("bt/{}", options.topic)
     };
-    let topic = participant.create_topic(name, "blaze::v1::Frame".to_owned(), &qos, TopicKind::NoKey)?;
+    let topic =
+        participant.create_topic(name, "blaze::v1::Frame".to_owned(), &qos, TopicKind::NoKey)?;
     let mut reader = participant
         .create_subscriber(&qos)?
         .create_datareader_no_key_cdr::<Frame>(&topic, Some(qos))?;

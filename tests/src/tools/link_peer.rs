@@ -4,9 +4,9 @@
 //! blaze-testbed link-peer name=edge/a listen=10.9.0.1 domain=33 [peers=10.9.0.2] [seconds=6] [chunking=mtu] [mtu=1500]
 //!           [send=<datagram bytes>x<count>@<per second>] [class=bulk] [interface=veth0]
 //! ```
-//! It says when it is up, connects to all that it discovers, tells each what addresses it knows as flows do in Hello, and prints what
-//! happens. With `send` it then sends to the first, and prints the bytes on the wire as computed and as the interface
-//! counted them (Ethernet headers deducted).
+//! It says when it is up, connects to all that it discovers, tells each what addresses it knows as
+//! flows do in Hello, and prints what happens. With `send` it then sends to the first, and prints
+//! the bytes on the wire as computed and as the interface counted them (Ethernet headers deducted).
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -36,10 +36,8 @@ pub(crate) struct Arguments {
 
 impl Arguments {
     fn get<T: FromStr>(&self, name: &str) -> Option<T> {
-        let value = self
-            .values
-            .iter()
-            .find_map(|argument| argument.strip_prefix(name)?.strip_prefix('='));
+        let value =
+            self.values.iter().find_map(|argument| argument.strip_prefix(name)?.strip_prefix('='));
         value.and_then(|value| value.parse().ok())
     }
 }
@@ -53,7 +51,8 @@ struct Seen {
 
 fn counters(interface: &str) -> (u64, u64) {
     let read = |name: &str| {
-        let text = fs::read_to_string(format!("/sys/class/net/{interface}/statistics/{name}")).unwrap_or_default();
+        let text = fs::read_to_string(format!("/sys/class/net/{interface}/statistics/{name}"))
+            .unwrap_or_default();
         text.trim().parse().unwrap_or(0)
     };
     (read("tx_bytes"), read("tx_packets"))
@@ -87,7 +86,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let seen = Arc::<Mutex<Seen>>::default();
     let log = Arc::clone(&seen);
     let epoch = arguments.get("epoch").unwrap_or(1);
-    let text = |name: &str, default: &str| arguments.get(name).unwrap_or_else(|| default.to_owned());
+    let text =
+        |name: &str, default: &str| arguments.get(name).unwrap_or_else(|| default.to_owned());
     let transport = DdsTransport::start(DdsConfig {
         domain: arguments.get("domain").unwrap_or(33),
         listen: arguments.get("listen").unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST)),
@@ -103,10 +103,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "whole" => Chunking::Whole,
             _ => Chunking::Auto,
         },
-        local: Endpoint {
-            flow: text("name", "edge/a").parse()?,
-            epoch,
-        },
+        local: Endpoint { flow: text("name", "edge/a").parse()?, epoch },
         next_epoch: Arc::new(move || epoch + 1),
         sink: Arc::new(move |event| note(&log, begin, event)),
     })?;
@@ -153,7 +150,12 @@ fn exchange_addresses(transport: &DdsTransport, seen: &Mutex<Seen>) {
     }
 }
 
-fn measure(transport: &DdsTransport, to: &Endpoint, arguments: &Arguments, order: &str) -> anyhow::Result<()> {
+fn measure(
+    transport: &DdsTransport,
+    to: &Endpoint,
+    arguments: &Arguments,
+    order: &str,
+) -> anyhow::Result<()> {
     let (size, rest) = order.split_once('x').context("send=<bytes>x<count>@<rate>")?;
     let (count, rate) = rest.split_once('@').context("send=<bytes>x<count>@<rate>")?;
     let (size, count, rate): (usize, u64, f64) = (size.parse()?, count.parse()?, rate.parse()?);

@@ -1,5 +1,5 @@
-//! A service that lives by its configuration: says on stdout what it gets, acknowledges it, and shows that it lives. Tests kill
-//! it like any service.
+//! A service that lives by its configuration: says on stdout what it gets, acknowledges it, and
+//! shows that it lives. Tests kill it like any service.
 //!
 //! ```text
 //! config {"revision":7,"deleted":false,"config":{…}}      for each change
@@ -83,9 +83,7 @@ pub(crate) async fn run(options: &Options) -> anyhow::Result<()> {
     if let (Some(revision), Some(value)) = (config.revision(), config.value()) {
         tokio::task::spawn_blocking(move || take(revision, Some(&value))).await?;
     }
-    tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?
-        .recv()
-        .await;
+    tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?.recv().await;
     service.shutdown().await;
     Ok(())
 }

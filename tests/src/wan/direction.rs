@@ -17,8 +17,8 @@ const OVERHEAD: u64 = 128;
 
 /// One direction of a link.
 ///
-/// A packet waits in the queue until those before it have left at the rate; then it is lost by chance or flies for the
-/// delay. A lost packet has used the rate like any other.
+/// A packet waits in the queue until those before it have left at the rate; then it is lost by
+/// chance or flies for the delay. A lost packet has used the rate like any other.
 #[derive(Debug)]
 pub struct Direction<P> {
     shape: Shape,
@@ -49,7 +49,8 @@ struct Flying<P> {
 }
 
 impl<P> Direction<P> {
-    /// A direction that loses and delays as its seed says: the same packets at the same times have the same fate.
+    /// A direction that loses and delays as its seed says: the same packets at the same times have
+    /// the same fate.
     #[must_use]
     pub fn new(shape: Shape, seed: u64) -> Self {
         Self {
@@ -111,11 +112,7 @@ impl<P> Direction<P> {
             return dropped.queue.add(bytes);
         }
         self.counts.queue.add(bytes);
-        self.waiting.push_back(Waiting {
-            came: now,
-            bytes,
-            packet,
-        });
+        self.waiting.push_back(Waiting { came: now, bytes, packet });
         self.advance(now);
     }
 
@@ -138,7 +135,9 @@ impl<P> Direction<P> {
         // The delay of a packet that waits is not drawn yet: this is the least it can be.
         let waiting = self.waiting.front().map(|packet| {
             let begin = self.free_at.map_or(packet.came, |free_at| free_at.max(packet.came));
-            begin + self.transmission(packet.bytes) + self.shape.delay.saturating_sub(self.shape.jitter)
+            begin
+                + self.transmission(packet.bytes)
+                + self.shape.delay.saturating_sub(self.shape.jitter)
         });
         match (flying, waiting) {
             (Some(flying), Some(waiting)) => Some(flying.min(waiting)),
@@ -177,11 +176,7 @@ impl<P> Direction<P> {
         let due = self.last_due.map_or(due, |last| due.max(last));
         self.last_due = Some(due);
         self.counts.flying.add(packet.bytes);
-        self.flying.push_back(Flying {
-            due,
-            bytes: packet.bytes,
-            packet: packet.packet,
-        });
+        self.flying.push_back(Flying { due, bytes: packet.bytes, packet: packet.packet });
     }
 
     fn delay(&mut self, at: Instant) -> Duration {
@@ -191,11 +186,7 @@ impl<P> Direction<P> {
         }
         let value = self.wander.at(at, jitter);
         let offset = jitter.mul_f64(value.abs());
-        if value < 0.0 {
-            delay.saturating_sub(offset)
-        } else {
-            delay + offset
-        }
+        if value < 0.0 { delay.saturating_sub(offset) } else { delay + offset }
     }
 
     /// Rounded up, so that the rate is never exceeded.

@@ -24,12 +24,7 @@ fn drain(direction: &mut Direction<u64>) -> Vec<(u64, Instant)> {
 fn the_rate_spaces_packets_and_the_queue_drops_what_it_cannot_hold() {
     let start = Instant::now();
     // 1000 bytes take 8 ms.
-    let shape = Shape {
-        rate: Some(1_000_000),
-        queue: 2_000,
-        delay: 10 * MS,
-        ..Shape::default()
-    };
+    let shape = Shape { rate: Some(1_000_000), queue: 2_000, delay: 10 * MS, ..Shape::default() };
     let mut direction = Direction::new(shape, 1);
     for packet in 0..5 {
         direction.offer(start, 1_000, packet);
@@ -59,11 +54,7 @@ fn a_rate_that_rises_lets_the_queue_go_faster() {
 #[test]
 fn a_cut_loses_what_is_on_the_way_and_healed_it_begins_anew() {
     let start = Instant::now();
-    let shape = Shape {
-        rate: Some(1_000_000),
-        delay: 50 * MS,
-        ..Shape::default()
-    };
+    let shape = Shape { rate: Some(1_000_000), delay: 50 * MS, ..Shape::default() };
     let mut direction = Direction::new(shape, 1);
     direction.offer(start, 1_000, 1);
     direction.offer(start, 1_000, 2);
@@ -90,9 +81,7 @@ fn larger_than_the_mtu_is_dropped() {
 #[test]
 fn memory_is_bounded() {
     let start = Instant::now();
-    let shape = Shape::default()
-        .with(Change::Delay(60_000 * MS))
-        .with(Change::Mtu(65_535));
+    let shape = Shape::default().with(Change::Delay(60_000 * MS)).with(Change::Mtu(65_535));
     let mut direction = Direction::new(shape, 1);
     for packet in 0..3_000 {
         direction.offer(start, 65_000, packet);
@@ -110,10 +99,7 @@ fn losses_are_as_likely_as_told_and_the_same_for_a_seed() {
         for packet in 0..100_000 {
             direction.offer(start, 100, packet);
         }
-        drain(&mut direction)
-            .into_iter()
-            .map(|(packet, _)| packet)
-            .collect::<Vec<_>>()
+        drain(&mut direction).into_iter().map(|(packet, _)| packet).collect::<Vec<_>>()
     };
     let (one, again, other) = (fate(1), fate(1), fate(2));
     assert_eq!(one, again);
@@ -127,9 +113,7 @@ fn losses_are_as_likely_as_told_and_the_same_for_a_seed() {
 #[test]
 fn jitter_wanders_over_its_whole_range_also_at_a_high_rate() {
     let start = Instant::now();
-    let shape = Shape::default()
-        .with(Change::Delay(25 * MS))
-        .with(Change::Jitter(5 * MS));
+    let shape = Shape::default().with(Change::Delay(25 * MS)).with(Change::Jitter(5 * MS));
     let mut direction = Direction::new(shape, 1);
     let mut sent = Vec::new();
     // 10,000 a second for a minute.
@@ -144,16 +128,12 @@ fn jitter_wanders_over_its_whole_range_also_at_a_high_rate() {
         .map(|(packet, at)| (*at - sent[*packet as usize]).as_secs_f64() * 1e3)
         .collect();
     let mean = delays.iter().sum::<f64>() / delays.len() as f64;
-    let (least, most) = delays
-        .iter()
-        .fold((f64::MAX, f64::MIN), |(least, most), d| (least.min(*d), most.max(*d)));
+    let (least, most) =
+        delays.iter().fold((f64::MAX, f64::MIN), |(least, most), d| (least.min(*d), most.max(*d)));
     assert!((mean - 25.0).abs() < 0.5, "mean {mean}");
     assert!((20.0..21.0).contains(&least), "least {least}");
     assert!(most > 29.0 && most <= 30.001, "most {most}");
-    assert!(
-        arrived.windows(2).all(|pair| pair[0].0 < pair[1].0),
-        "the order is kept"
-    );
+    assert!(arrived.windows(2).all(|pair| pair[0].0 < pair[1].0), "the order is kept");
 }
 
 /// What happens to a direction in a random run.
@@ -214,7 +194,10 @@ proptest! {
                 Step::Heal => direction.heal(),
             }
             let stats = direction.stats();
-            prop_assert_eq!(stats.taken, stats.out + stats.dropped.total() + stats.queue + stats.flying);
+            prop_assert_eq!(
+                stats.taken,
+                stats.out + stats.dropped.total() + stats.queue + stats.flying,
+            );
         }
         arrived.extend(drain(&mut direction).into_iter().map(|(packet, _)| packet));
         let stats = direction.stats();
@@ -223,8 +206,8 @@ proptest! {
         prop_assert!(arrived.windows(2).all(|pair| pair[0] < pair[1]), "{:?}", arrived);
     }
 
-    /// In no window leaves more than the rate lets through, but for the packet that leaves as it begins. Jitter moves the
-    /// ends of a window.
+    /// In no window leaves more than the rate lets through, but for the packet that leaves as it
+    /// begins. Jitter moves the ends of a window.
     #[test]
     fn the_rate_holds_in_every_window(
         packets in proptest::collection::vec((0_u64..2_000, 40_u64..1_500), 2..200),
@@ -232,7 +215,8 @@ proptest! {
         jitter_us in prop_oneof![Just(0_u64), 0_u64..5_000],
     ) {
         let jitter = Duration::from_micros(jitter_us);
-        let shape = Shape { rate: Some(rate), delay: 10 * MS, jitter, queue: 20_000, ..Shape::default() };
+        let shape =
+            Shape { rate: Some(rate), delay: 10 * MS, jitter, queue: 20_000, ..Shape::default() };
         let mut direction = Direction::new(shape, 3);
         let mut now = Instant::now();
         let sizes: Vec<u64> = packets.iter().map(|(_, bytes)| *bytes).collect();
@@ -247,14 +231,19 @@ proptest! {
                 bits += sizes[*packet as usize] * 8;
                 let window = (*at - arrived[first].1 + 2 * jitter).as_secs_f64();
                 // A nanosecond of rounding for each packet.
-                prop_assert!(bits as f64 <= rate as f64 * (window + 1e-6), "{bits} bits in {window} s at {rate}");
+                prop_assert!(
+                    bits as f64 <= rate as f64 * (window + 1e-6),
+                    "{bits} bits in {window} s at {rate}",
+                );
             }
         }
     }
 
-    /// Without jitter each packet takes the delay, the time at the rate, and the wait for those before it.
+    /// Without jitter each packet takes the delay, the time at the rate, and the wait for those
+    /// before it.
     #[test]
-    fn the_delay_is_exact(gaps in proptest::collection::vec(0_u64..2_000, 1..100), delay_us in 0_u64..100_000) {
+    fn the_delay_is_exact(gaps in proptest::collection::vec(0_u64..2_000, 1..100),
+        delay_us in 0_u64..100_000) {
         let delay = Duration::from_micros(delay_us);
         // 1000 bytes a millisecond.
         let shape = Shape { rate: Some(8_000_000), delay, queue: u64::MAX, ..Shape::default() };

@@ -17,7 +17,8 @@ pub struct Shape {
     pub rate: Option<u64>,
     /// Bytes that may wait for the rate; what comes beyond them is dropped.
     pub queue: u64,
-    /// Larger packets are dropped without a word, as a router behind a firewall does. Bytes, IP header included.
+    /// Larger packets are dropped without a word, as a router behind a firewall does. Bytes, IP
+    /// header included.
     pub mtu: u32,
 }
 

@@ -27,10 +27,7 @@ impl std::ops::Add for Tally {
     type Output = Self;
 
     fn add(self, other: Self) -> Self {
-        Self {
-            packets: self.packets + other.packets,
-            bytes: self.bytes + other.bytes,
-        }
+        Self { packets: self.packets + other.packets, bytes: self.bytes + other.bytes }
     }
 }
 
@@ -74,7 +71,8 @@ pub struct DirectionStats {
     /// Packets of `out` that the interface at the other end refused.
     #[serde(default)]
     pub refused: u64,
-    /// Packets that the kernel dropped before they came in, because the emulator did not get the processor in time.
+    /// Packets that the kernel dropped before they came in, because the emulator did not get the
+    /// processor in time.
     #[serde(default)]
     pub missed: u64,
 }
@@ -94,9 +92,6 @@ impl LinkStats {
     /// The same, seen from the other end.
     #[must_use]
     pub fn flipped(self) -> Self {
-        Self {
-            forward: self.back,
-            back: self.forward,
-        }
+        Self { forward: self.back, back: self.forward }
     }
 }

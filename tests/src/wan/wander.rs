@@ -1,8 +1,9 @@
 //! Jitter that keeps the order of packets by itself.
 //!
-//! A delay drawn anew for each packet would have to be held back to that of the packet before, so at thousands of packets
-//! a second it would always be the largest. Here it wanders: from one random value to the next in a time of four times the
-//! jitter, so that it never falls faster than half as fast as time passes, and no packet can overtake another.
+//! A delay drawn anew for each packet would have to be held back to that of the packet before, so
+//! at thousands of packets a second it would always be the largest. Here it wanders: from one
+//! random value to the next in a time of four times the jitter, so that it never falls faster than
+//! half as fast as time passes, and no packet can overtake another.
 
 use std::time::{Duration, Instant};
 
@@ -28,10 +29,7 @@ struct Leg {
 
 impl Wander {
     pub(super) fn new(seed: u64) -> Self {
-        Self {
-            random: StdRng::seed_from_u64(seed),
-            leg: None,
-        }
+        Self { random: StdRng::seed_from_u64(seed), leg: None }
     }
 
     /// A value that does not depend on those before.
@@ -44,19 +42,11 @@ impl Wander {
         let period = (jitter * 4).max(MIN_PERIOD);
         let leg = match self.leg {
             Some(leg) if time <= leg.until => leg,
-            Some(leg) if time <= leg.until + period => Leg {
-                from: leg.until,
-                until: leg.until + period,
-                start: leg.end,
-                end: self.jump(),
-            },
+            Some(leg) if time <= leg.until + period => {
+                Leg { from: leg.until, until: leg.until + period, start: leg.end, end: self.jump() }
+            }
             // The last packet is so long ago that none can be overtaken.
-            _ => Leg {
-                from: time,
-                until: time + period,
-                start: self.jump(),
-                end: self.jump(),
-            },
+            _ => Leg { from: time, until: time + period, start: self.jump(), end: self.jump() },
         };
         self.leg = Some(leg);
         let passed = time.saturating_duration_since(leg.from).as_secs_f64();

@@ -10,7 +10,8 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// Each command of the page, with curl and with `blaze`, on SQLite and on MongoDB; what they print is what the page shows.
+/// Each command of the page, with curl and with `blaze`, on SQLite and on MongoDB; what they print
+/// is what the page shows.
 #[test]
 fn the_tour_runs_as_it_stands() {
     let program = binary("blaze-config").unwrap();
@@ -20,10 +21,8 @@ fn the_tour_runs_as_it_stands() {
         .env("BLAZE_TEST_MONGODB_URI", shared_mongo().unwrap())
         .output()
         .unwrap();
-    let (said, faults) = (
-        String::from_utf8_lossy(&output.stdout),
-        String::from_utf8_lossy(&output.stderr),
-    );
+    let (said, faults) =
+        (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     println!("{said}{faults}");
     assert!(output.status.success(), "{}", output.status);
     for way in ["sqlite", "mongodb", "curl", "cli"] {

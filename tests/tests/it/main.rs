@@ -1,8 +1,8 @@
 //! Tests over crates, real servers and real processes; those that need root are in `net`.
 //!
-//! Where a test runs is in its path: what stands below a module `quick` runs in every tier, below `long` with
-//! `scripts/test --long` alone, everything else with `scripts/test`. They need `cargo build --workspace` and
-//! `scripts/services install`.
+//! Where a test runs is in its path: what stands below a module `quick` runs in every tier, below
+//! `long` with `scripts/test --long` alone, everything else with `scripts/test`. They need `cargo
+//! build --workspace` and `scripts/services install`.
 
 #![allow(
     clippy::unwrap_used,

@@ -1,4 +1,5 @@
-//! A link that is cut for longer than the time after which a flow counts as down: one way, the other way, and both.
+//! A link that is cut for longer than the time after which a flow counts as down: one way, the
+//! other way, and both.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -32,22 +33,16 @@ fn watched() -> Duration {
 }
 const IMU_LIFESPAN: Duration = Duration::from_secs(2);
 const SCAN_LIFESPAN: Duration = Duration::from_millis(500);
-/// From the link to the consumer's callback, on a busy machine; lifespans are the flows' business, not the consumer's.
+/// From the link to the consumer's callback, on a busy machine; lifespans are the flows' business,
+/// not the consumer's.
 pub(super) const DELIVERY: Duration = Duration::from_millis(300);
 
 /// Reliable ones with and without a lifespan, and more bulk than the limit allows.
 fn streams() -> Vec<Stream> {
     vec![
-        Stream {
-            lifespan: IMU_LIFESPAN,
-            ..stream(IMU, 50.0, 320)
-        },
+        Stream { lifespan: IMU_LIFESPAN, ..stream(IMU, 50.0, 320) },
         stream(EVENTS, 5.0, 200),
-        Stream {
-            reliable: false,
-            lifespan: SCAN_LIFESPAN,
-            ..stream(SCANS, 50.0, 100_000)
-        },
+        Stream { reliable: false, lifespan: SCAN_LIFESPAN, ..stream(SCANS, 50.0, 100_000) },
     ]
 }
 
@@ -68,7 +63,9 @@ pub(super) type Delivered = BTreeMap<String, u64>;
 fn delivered(running: &Running) -> Delivered {
     let mut delivered = Delivered::new();
     for bridge in running.flow("cloud-1").map(FlowProcess::bridges).unwrap_or_default() {
-        if let (Some(topic), Some(out)) = (bridge["topic"].as_str(), bridge["out"]["messages"].as_u64()) {
+        if let (Some(topic), Some(out)) =
+            (bridge["topic"].as_str(), bridge["out"]["messages"].as_u64())
+        {
             *delivered.entry(topic.to_owned()).or_default() += out;
         }
     }
@@ -110,7 +107,8 @@ pub(super) struct Healed {
     pub(super) busiest: f64,
 }
 
-/// Heals a link, and watches it until these topics flow again, and a while longer. `before`: what arrived before it was cut.
+/// Heals a link, and watches it until these topics flow again, and a while longer. `before`: what
+/// arrived before it was cut.
 pub(super) fn watch(
     running: &Running,
     ways: Ways,
@@ -146,7 +144,8 @@ pub(super) fn watch(
             healed.elapsed() > watched() && hello.is_some() && flowing.len() == topics.len()
         },
         || {
-            let silent: Vec<_> = topics.iter().map(|topic| (topic, dropped(running, topic))).collect();
+            let silent: Vec<_> =
+                topics.iter().map(|topic| (topic, dropped(running, topic))).collect();
             format!("{}\n{silent:?}", running.tails())
         },
     )?;
@@ -168,24 +167,20 @@ fn cut(running: &Running, ways: Ways) -> anyhow::Result<()> {
     let healed = watch(running, ways, &[IMU], &arrived)?;
     let busiest = healed.busiest / LIMIT_BYTES_PER_S;
     println!(
-        "  first Hello {:.0?} after it was healed, flowing {:.0?} after; busiest second {:.1} % of the limit",
+        "  first Hello {:.0?} after it was healed, flowing {:.0?} after; busiest second {:.1} % of \
+         the limit",
         healed.hello,
         healed.flowing[IMU],
         busiest * 100.0
     );
-    anyhow::ensure!(
-        healed.flowing[IMU] <= healed.hello + within(FLOWING),
-        "{ways:?}: too late"
-    );
+    anyhow::ensure!(healed.flowing[IMU] <= healed.hello + within(FLOWING), "{ways:?}: too late");
     anyhow::ensure!(busiest <= 1.0, "{ways:?}: more than the limit");
     for ((stream, before), lifespan) in
-        streams()
-            .iter()
-            .zip(before)
-            .zip([Some(IMU_LIFESPAN), None, Some(SCAN_LIFESPAN)])
+        streams().iter().zip(before).zip([Some(IMU_LIFESPAN), None, Some(SCAN_LIFESPAN)])
     {
         let topic = stream.topic;
-        let (route, dropped) = (running.route("recorder", topic, &since)?, dropped(running, topic)?);
+        let (route, dropped) =
+            (running.route("recorder", topic, &since)?, dropped(running, topic)?);
         println!("  {route}\n    dropped since the start {dropped}");
         anyhow::ensure!(
             route.duplicated == 0 && route.reordered == 0,

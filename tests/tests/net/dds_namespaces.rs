@@ -1,4 +1,5 @@
-//! The DDS link between network namespaces: discovery with one seed, nothing but unicast, bytes on the wire.
+//! The DDS link between network namespaces: discovery with one seed, nothing but unicast, bytes on
+//! the wire.
 //!
 //! Runs `blaze-testbed link-peer` inside the namespaces.
 
@@ -37,9 +38,8 @@ fn text(output: Output) -> String {
 
 /// Milliseconds until a line `discovered <endpoint> after <n> ms`.
 fn discovered_after(log: &str, endpoint: &str) -> u64 {
-    let line = log
-        .lines()
-        .find_map(|line| line.strip_prefix(&format!("discovered {endpoint} after ")));
+    let line =
+        log.lines().find_map(|line| line.strip_prefix(&format!("discovered {endpoint} after ")));
     let millis = line
         .and_then(|rest| rest.strip_suffix(" ms"))
         .unwrap_or_else(|| panic!("no {endpoint} in:\n{log}"));
@@ -55,7 +55,8 @@ fn number(log: &str, word: &str) -> f64 {
         .unwrap_or_else(|| panic!("no {word} in:\n{log}"))
 }
 
-/// Two know the third, the seed; they must learn of each other from it. Each starts when the one before is up.
+/// Two know the third, the seed; they must learn of each other from it. Each starts when the one
+/// before is up.
 #[test]
 fn three_flows_meet_with_one_seed_whichever_starts_first() {
     const NAMES: [&str; 3] = ["edge/a", "fog/b", "cloud/c"];
@@ -111,10 +112,8 @@ fn computed_bytes_are_those_of_the_interface_and_nothing_fragments() {
         host("robot"),
         &format!("name=edge/a seconds=6 peers={seed} interface=v0 send=1296x2000@1000"),
     );
-    let (robot, fog) = (
-        text(robot.wait_with_output().unwrap()),
-        text(fog.wait_with_output().unwrap()),
-    );
+    let (robot, fog) =
+        (text(robot.wait_with_output().unwrap()), text(fog.wait_with_output().unwrap()));
     assert!(discovered_after(&robot, "fog/b/1") <= 3000, "{robot}");
     let (computed, counted) = (number(&robot, "computed"), number(&robot, "counted"));
     assert!((computed / counted - 1.0).abs() < 0.03, "{robot}");

@@ -1,5 +1,5 @@
-//! The whole system: two robots, a fog with two flows over one Kafka, a cloud with another, and links between the layers like
-//! those of the paper's testbed.
+//! The whole system: two robots, a fog with two flows over one Kafka, a cloud with another, and
+//! links between the layers like those of the paper's testbed.
 
 use std::time::Duration;
 
@@ -19,23 +19,12 @@ const IMAGE: usize = 921_600;
 const EDGE_DOMAIN: u16 = 30;
 
 pub(super) fn stream(topic: &'static str, hz: f64, bytes: usize) -> Stream {
-    Stream {
-        topic,
-        reliable: true,
-        hz,
-        bytes,
-        lifespan: Duration::ZERO,
-        payloads: None,
-    }
+    Stream { topic, reliable: true, hz, bytes, lifespan: Duration::ZERO, payloads: None }
 }
 
 /// The camera as it comes from the driver: best effort, and old pictures are worth nothing.
 pub(super) fn camera(hz: f64) -> Stream {
-    Stream {
-        reliable: false,
-        lifespan: Duration::from_secs(1),
-        ..stream(CAMERA, hz, IMAGE)
-    }
+    Stream { reliable: false, lifespan: Duration::from_secs(1), ..stream(CAMERA, hz, IMAGE) }
 }
 
 pub(super) fn flow(
@@ -58,22 +47,27 @@ pub(super) fn flow(
     }
 }
 
-pub(super) fn service(name: &'static str, flow: &'static str, broker: &'static str, streams: Vec<Stream>) -> Service {
-    Service {
-        name,
-        flow,
-        broker,
-        streams,
-    }
+pub(super) fn service(
+    name: &'static str,
+    flow: &'static str,
+    broker: &'static str,
+    streams: Vec<Stream>,
+) -> Service {
+    Service { name, flow, broker, streams }
 }
 
 pub(super) fn broker(name: &'static str, host: &'static str, kind: BrokerKind) -> Broker {
     Broker { name, host, kind }
 }
 
-/// A robot with a Redis, a cloud with some broker, one link between them, and streams from the one to the other; without faults
-/// or an end.
-pub(super) fn one_link(shape: Shape, cloud: BrokerKind, limit_mbps: f64, streams: Vec<Stream>) -> Scenario {
+/// A robot with a Redis, a cloud with some broker, one link between them, and streams from the one
+/// to the other; without faults or an end.
+pub(super) fn one_link(
+    shape: Shape,
+    cloud: BrokerKind,
+    limit_mbps: f64,
+    streams: Vec<Stream>,
+) -> Scenario {
     let flow = |layer, node, broker, peers: &[&'static str]| Flow {
         limit_mbps,
         ..flow(layer, node, broker, None, peers)
@@ -98,13 +92,15 @@ pub(super) fn one_link(shape: Shape, cloud: BrokerKind, limit_mbps: f64, streams
     }
 }
 
-/// Robots with a Redis each meet over DDS in the edge; fog and cloud have a Kafka each, the fog two flows over it.
+/// Robots with a Redis each meet over DDS in the edge; fog and cloud have a Kafka each, the fog two
+/// flows over it.
 pub(super) fn three_layers(image_hz: f64) -> Scenario {
     let shape = Shape::to_cloud();
     let (imu, odometry) = (stream(IMU, 50.0, 320), stream(ODOMETRY, 50.0, 700));
     let (commands, map) = (stream(COMMANDS, 10.0, 100), stream(MAP, 5.0, 4_000));
     Scenario {
-        name: "two robots, two flows in the fog, one in the cloud; 25 ± 5 ms, 0.01 % loss, 160 Mbit/s between layers",
+        name: "two robots, two flows in the fog, one in the cloud; 25 ± 5 ms, 0.01 % loss, 160 \
+            Mbit/s between layers",
         network: Plan::new()
             .with_hosts(&["robot-1", "robot-2", "edge", "fog-1", "fog-2", "fog", "cloud-1"])
             .with_lan(&["robot-1", "robot-2", "edge"])
@@ -139,12 +135,7 @@ pub(super) fn three_layers(image_hz: f64) -> Scenario {
                 vec![imu.clone(), odometry.clone(), commands.clone()],
             ),
             service("viewer", "fog-2", "kafka-fog", vec![camera(image_hz)]),
-            service(
-                "recorder",
-                "cloud-1",
-                "kafka-cloud",
-                vec![imu.clone(), odometry, map.clone()],
-            ),
+            service("recorder", "cloud-1", "kafka-cloud", vec![imu.clone(), odometry, map.clone()]),
             service("archive", "cloud-1", "kafka-cloud", vec![camera(image_hz)]),
             service("neighbour", "robot-2", "redis-2", vec![imu, commands.clone()]),
             service("pilot", "robot-1", "redis-1", vec![commands, map]),
@@ -158,9 +149,7 @@ pub(super) fn three_layers(image_hz: f64) -> Scenario {
 
 /// Every reliable topic arrives at every consumer, each message once and in order.
 fn whole() -> Vec<Expect> {
-    RELIABLE
-        .map(|(consumer, topic)| Expect::Whole(consumer, topic))
-        .to_vec()
+    RELIABLE.map(|(consumer, topic)| Expect::Whole(consumer, topic)).to_vec()
 }
 
 /// Who gets which reliable topic.

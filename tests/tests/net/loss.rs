@@ -1,5 +1,5 @@
-//! A link that loses 1 % both ways: what is reliable is whole, what is not shows its losses, pictures are repaired within
-//! their lifespan, and no topic waits for another's repair.
+//! A link that loses 1 % both ways: what is reliable is whole, what is not shows its losses,
+//! pictures are repaired within their lifespan, and no topic waits for another's repair.
 
 use std::time::Duration;
 
@@ -13,19 +13,17 @@ const BEST_EFFORT: &str = "imu/best_effort";
 const RELIABLE: &str = "imu/reliable";
 const PICTURES: &str = "pictures";
 const PICTURES_HZ: f64 = 4.0;
-/// What a reliable message may take that has to be sent again, on a link with a round trip below 1 ms. Its loss is known
-/// with the next Feedback (50 ms or 64 samples), the repair may be lost again.
+/// What a reliable message may take that has to be sent again, on a link with a round trip below 1
+/// ms. Its loss is known with the next Feedback (50 ms or 64 samples), the repair may be lost
+/// again.
 const REPAIRED_MS: f64 = 200.0;
-/// What a message may take that is never repaired itself: below the 50 ms that others' repairs take, above the pauses of a
-/// busy machine.
+/// What a message may take that is never repaired itself: below the 50 ms that others' repairs
+/// take, above the pauses of a busy machine.
 const UNTOUCHED_MS: f64 = 30.0;
 
 /// The picture has 154 parts: without repair one of five would be whole.
 fn streams() -> Vec<Stream> {
-    let best_effort = |stream| Stream {
-        reliable: false,
-        ..stream
-    };
+    let best_effort = |stream| Stream { reliable: false, ..stream };
     vec![
         stream(RELIABLE, 100.0, 320),
         best_effort(stream(BEST_EFFORT, 100.0, 320)),
@@ -66,19 +64,12 @@ fn a_link_that_loses_one_percent_is_repaired() -> anyhow::Result<()> {
         let (lost, received) = (best_effort.gaps() - clean.gaps(), best_effort.latencies_ms.len());
         let share = lost as f64 / (lost as f64 + received as f64);
         anyhow::ensure!(lost > 0 && share < 0.05, "best effort: {lost} lost, {share:.3}");
-        anyhow::ensure!(
-            reliable.gaps() == 0 && reliable.rate_hz() >= 95.0,
-            "reliable: {reliable}"
-        );
+        anyhow::ensure!(reliable.gaps() == 0 && reliable.rate_hz() >= 95.0, "reliable: {reliable}");
         anyhow::ensure!(
             pictures.rate_hz() >= 0.75 * PICTURES_HZ,
             "pictures are not repaired: {pictures}"
         );
-        anyhow::ensure!(
-            p99_ms(&reliable) < REPAIRED_MS,
-            "reliable: p99 {} ms",
-            p99_ms(&reliable)
-        );
+        anyhow::ensure!(p99_ms(&reliable) < REPAIRED_MS, "reliable: p99 {} ms", p99_ms(&reliable));
         // What is never repaired itself must not notice the repairs of others.
         let untouched = UNTOUCHED_MS.max(3.0 * p99_ms(&clean));
         anyhow::ensure!(

@@ -1,6 +1,7 @@
 //! The link emulator, networks of namespaces, the fault proxy, and scenarios over them.
 //!
-//! Needs root, iproute2 and `/dev/net/tun`; scenarios need `scripts/services install` as well. `BLAZE_LONG` selects the full durations.
+//! Needs root, iproute2 and `/dev/net/tun`; scenarios need `scripts/services install` as well.
+//! `BLAZE_LONG` selects the full durations.
 
 #![allow(
     clippy::unwrap_used,

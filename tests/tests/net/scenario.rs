@@ -9,15 +9,17 @@ use blaze_tests::wan::{Change, Shape, Ways};
 
 use super::layers::{COMMANDS, IMU, broker, flow, service, stream};
 
-/// A robot with Redis behind the router of its edge, a cloud with Kafka, and the link of the paper's testbed between them.
-/// It is cut for less than the time after which a flow counts as down, gets slow and loses much for a while, and is good again.
+/// A robot with Redis behind the router of its edge, a cloud with Kafka, and the link of the
+/// paper's testbed between them. It is cut for less than the time after which a flow counts as
+/// down, gets slow and loses much for a while, and is good again.
 fn robot_and_cloud() -> Scenario {
     let at = Duration::from_millis;
     let (router, cloud) = ("router", "cloud-1");
     let bad = vec![Change::Delay(at(80)), Change::Loss(0.02), Change::Rate(Some(5_000_000))];
     let good = Shape::to_cloud().changes();
     Scenario {
-        name: "25 ± 5 ms, 0.01 % loss, 160 Mbit/s; cut for 1.2 s one way and both, slow and lossy for 2 s",
+        name: "25 ± 5 ms, 0.01 % loss, 160 Mbit/s; cut for 1.2 s one way and both, slow and lossy \
+            for 2 s",
         network: Plan::new()
             .with_hosts(&["robot-1", router, cloud])
             .with_lan(&["robot-1", router])

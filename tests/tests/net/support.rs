@@ -52,15 +52,17 @@ impl Sink {
                 }
             }
         });
-        Ok(Self {
-            address,
-            stop,
-            thread: Some(thread),
-        })
+        Ok(Self { address, stop, thread: Some(thread) })
     }
 
     /// Sends packets of so many payload bytes from a socket, at a pace.
-    pub(crate) fn send(&self, from: &UdpSocket, count: u64, bytes: usize, gap: Duration) -> anyhow::Result<()> {
+    pub(crate) fn send(
+        &self,
+        from: &UdpSocket,
+        count: u64,
+        bytes: usize,
+        gap: Duration,
+    ) -> anyhow::Result<()> {
         hurry();
         let (begin, payload) = (Instant::now(), vec![0; bytes]);
         for number in 0..count {
@@ -85,7 +87,8 @@ impl Drop for Sink {
     }
 }
 
-/// Sorted round trips of small packets to a host that echoes, one after another; those that do not come back are left out.
+/// Sorted round trips of small packets to a host that echoes, one after another; those that do not
+/// come back are left out.
 pub(crate) fn ping(from: &UdpSocket, to: &Sink, count: usize) -> anyhow::Result<Vec<Duration>> {
     let mut trips = Vec::new();
     hurry();
@@ -127,11 +130,7 @@ impl Reading {
     pub(crate) fn of(link: &Link<'_>) -> anyhow::Result<Self> {
         let from = Instant::now();
         let bytes = link.stats()?.forward.taken.bytes;
-        Ok(Self {
-            from,
-            to: Instant::now(),
-            bytes,
-        })
+        Ok(Self { from, to: Instant::now(), bytes })
     }
 
     /// Bytes per second up to a later one.
@@ -145,12 +144,12 @@ impl Reading {
     }
 }
 
-/// Bytes per second of the busiest second, at least. How long it takes to ask is no excuse and no fault.
+/// Bytes per second of the busiest second, at least. How long it takes to ask is no excuse and no
+/// fault.
 pub(crate) fn busiest(readings: &[Reading]) -> f64 {
     let seconds = readings.iter().enumerate().filter_map(|(index, first)| {
-        let last = readings[index..]
-            .iter()
-            .find(|last| last.to - first.from >= Duration::from_secs(1))?;
+        let last =
+            readings[index..].iter().find(|last| last.to - first.from >= Duration::from_secs(1))?;
         Some(first.least_rate_to(last))
     });
     seconds.fold(0.0, f64::max)
@@ -158,10 +157,8 @@ pub(crate) fn busiest(readings: &[Reading]) -> f64 {
 
 /// Whether a packet from one host reaches another, and which address it comes from.
 pub(crate) fn reaches(from: &Host, to: &Host) -> anyhow::Result<Option<Ipv4Addr>> {
-    let (sender, receiver) = (
-        inside(&from.namespace, || Ok(UdpSocket::bind("0.0.0.0:0")?))?,
-        socket(to)?,
-    );
+    let (sender, receiver) =
+        (inside(&from.namespace, || Ok(UdpSocket::bind("0.0.0.0:0")?))?, socket(to)?);
     receiver.set_read_timeout(Some(Duration::from_secs(1)))?;
     sender.send_to(b"here", receiver.local_addr()?)?;
     let mut buffer = [0; 10];

@@ -35,11 +35,7 @@ impl Subject {
             .enable_all()
             .build()
             .unwrap();
-        Self {
-            kind,
-            folder: tempfile::tempdir().unwrap(),
-            runtime,
-        }
+        Self { kind, folder: tempfile::tempdir().unwrap(), runtime }
     }
 
     fn open(&self) -> Box<dyn LocalCopy> {
@@ -48,9 +44,9 @@ impl Subject {
         match &self.kind {
             Kind::File => Box::new(FileCopy::new(self.folder.path(), layer, vault)),
             #[cfg(feature = "mongodb")]
-            Kind::Mongo { uri, database } => {
-                Box::new(super::MongoCopy::new(uri.clone().into(), database, layer, None, vault).unwrap())
-            }
+            Kind::Mongo { uri, database } => Box::new(
+                super::MongoCopy::new(uri.clone().into(), database, layer, None, vault).unwrap(),
+            ),
         }
     }
 
@@ -64,7 +60,8 @@ impl Subject {
 #[cfg(feature = "mongodb")]
 fn mongo_server() -> Kind {
     let uri = blaze_runtime::environment::variable("BLAZE_TEST_MONGODB_URI");
-    let uri = uri.expect("BLAZE_TEST_MONGODB_URI, which is in .services/env after `scripts/services start`");
+    let uri = uri
+        .expect("BLAZE_TEST_MONGODB_URI, which is in .services/env after `scripts/services start`");
     let database = format!("blaze_copy_{:016x}", rand::random::<u64>());
     Kind::Mongo { uri, database }
 }
@@ -102,14 +99,17 @@ fn a_large_copy_is_kept(subject: &Subject) {
         let text = "\u{e4}".repeat(120 * 1024);
         let whole = loaded(
             7,
-            (0..80).map(|number| service(&format!("s{number}"), 7, json!({ "config": { "a": text } }))),
+            (0..80).map(|number| {
+                service(&format!("s{number}"), 7, json!({ "config": { "a": text } }))
+            }),
         );
         subject.open().replace(&whole).await.unwrap();
         assert!(subject.found().await == Some(whole));
     });
 }
 
-/// Whoever began from an older state, because this copy could not be read then, does not write it over the newer one.
+/// Whoever began from an older state, because this copy could not be read then, does not write it
+/// over the newer one.
 fn nothing_older_of_the_same_store_replaces_it(subject: &Subject) {
     subject.runtime.block_on(async {
         assert_eq!(subject.found().await, None);
@@ -120,10 +120,7 @@ fn nothing_older_of_the_same_store_replaces_it(subject: &Subject) {
             assert!(!refused.is_unreadable(), "{refused}");
             assert_eq!(subject.found().await.as_ref(), Some(&held));
         }
-        let again = Loaded {
-            documents: Vec::new(),
-            ..held
-        };
+        let again = Loaded { documents: Vec::new(), ..held };
         for _ in 0..3 {
             subject.open().replace(&again).await.unwrap();
             assert_eq!(
@@ -175,17 +172,15 @@ mod in_mongodb {
         subject.runtime.block_on(async {
             let client = mongodb::Client::with_uri_str(uri).await.unwrap();
             let database = client.database(database);
-            let (head, chunks) = (database.collection::<Document>("head"), database.collection("chunks"));
+            let (head, chunks) =
+                (database.collection::<Document>("head"), database.collection("chunks"));
             let held = sample(5);
             subject.open().replace(&held).await.unwrap();
             let before = head.find_one(doc! {}).await.unwrap().unwrap();
             let generation = before.get_str("generation").unwrap();
             let later = u64::from_str_radix(&generation[..16], 16).unwrap() + 1;
             let bytes = b"cut off".to_vec();
-            let chunk = Binary {
-                subtype: BinarySubtype::Generic,
-                bytes,
-            };
+            let chunk = Binary { subtype: BinarySubtype::Generic, bytes };
             let stray = doc! { "_id": format!("edge/{later:016x}-0/00000000"), "data": chunk };
             chunks.insert_one(stray).await.unwrap();
             assert_eq!(subject.found().await.as_ref(), Some(&held));
@@ -193,7 +188,8 @@ mod in_mongodb {
             assert_eq!(subject.found().await, Some(sample(6)));
             tokio::time::sleep(std::time::Duration::from_millis(5)).await;
             subject.open().replace(&sample(7)).await.unwrap();
-            let left: Vec<Document> = chunks.find(doc! {}).await.unwrap().try_collect().await.unwrap();
+            let left: Vec<Document> =
+                chunks.find(doc! {}).await.unwrap().try_collect().await.unwrap();
             assert_eq!(left.len(), 1, "{left:?}");
         });
     }
@@ -208,9 +204,13 @@ mod in_mongodb {
             let client = mongodb::Client::with_uri_str(uri).await.unwrap();
             let tables = client.database(database);
             // With a key all but the first line is encrypted.
-            for (revision, vault, is_plain) in [(5, Vault::default(), true), (6, Vault::with_key([7; 32]), false)] {
+            for (revision, vault, is_plain) in
+                [(5, Vault::default(), true), (6, Vault::with_key([7; 32]), false)]
+            {
                 let layer = "edge".parse().unwrap();
-                let copy = crate::copy::MongoCopy::new(uri.clone().into(), database, layer, None, vault).unwrap();
+                let copy =
+                    crate::copy::MongoCopy::new(uri.clone().into(), database, layer, None, vault)
+                        .unwrap();
                 copy.replace(&sample(revision)).await.unwrap();
                 let head = tables.collection::<Document>("head").find_one(doc! {}).await.unwrap();
                 let chunks = tables.collection::<Document>("chunks").find(doc! {}).await.unwrap();
@@ -246,7 +246,11 @@ mod in_mongodb {
                 subject.open().replace(&sample(5)).await.unwrap();
                 head.update_one(doc! {}, change).await.unwrap();
                 let next = subject.open().replace(&sample(6)).await;
-                assert_eq!(matches!(next, Err(CopyError::NewerFormat { .. })), is_newer, "{next:?}");
+                assert_eq!(
+                    matches!(next, Err(CopyError::NewerFormat { .. })),
+                    is_newer,
+                    "{next:?}"
+                );
                 if !is_newer {
                     assert_eq!(subject.found().await, Some(sample(6)));
                 }

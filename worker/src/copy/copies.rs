@@ -6,8 +6,8 @@
 //! could not be read at the start ─▶ task: load until it can be ──▶ Found ──▶ engine
 //! ```
 //!
-//! A slot holds one update; a newer update replaces it. So a caller never waits, a copy that is slow or away
-//! costs one state, and the newest state is written.
+//! A slot holds one update; a newer update replaces it. So a caller never waits, a copy that is
+//! slow or away costs one state, and the newest state is written.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -23,11 +23,12 @@ use super::{CopyError, Loaded, LocalCopy, Notes, Position};
 
 /// Bounds of the pause after a failure; the pause is drawn from zero to the bound, which doubles.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
-/// A copy rests this many times as long as the write took, between these bounds: each write is of all documents, which
-/// costs processor time and wears out flash memory.
+/// A copy rests this many times as long as the write took, between these bounds: each write is of
+/// all documents, which costs processor time and wears out flash memory.
 const REST: u32 = 4;
 const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(10));
-/// A copy with at most so many documents rests no longer than this: a state within the rest is lost with the power.
+/// A copy with at most so many documents rests no longer than this: a state within the rest is lost
+/// with the power.
 const SMALL: (usize, Duration) = (1_000, Duration::from_secs(1));
 /// Where only the time of the position moves on, a copy is written again when it is this old.
 const MAX_AGE: Duration = Duration::from_secs(300);
@@ -50,7 +51,8 @@ pub struct Update {
 pub struct Target {
     /// The copy.
     pub copy: Arc<dyn LocalCopy>,
-    /// What it holds is known, or that nobody here can read it; else it is read before anything is written.
+    /// What it holds is known, or that nobody here can read it; else it is read before anything is
+    /// written.
     pub is_read: bool,
     /// Position of its content, if all copies hold the same notes.
     pub written: Option<Position>,
@@ -153,14 +155,15 @@ impl Slot {
 impl Copies {
     /// Starts one task per copy. `found` takes what is read later.
     #[must_use]
-    pub fn start(supervisor: &Supervisor, targets: Vec<Target>, found: &mpsc::Sender<Found>) -> Self {
+    pub fn start(
+        supervisor: &Supervisor,
+        targets: Vec<Target>,
+        found: &mpsc::Sender<Found>,
+    ) -> Self {
         let answers = watch::Sender::new(false);
         let start = |target: Target| {
             let place = target.copy.describe();
-            let slot = Arc::new(Slot {
-                place,
-                ..Slot::default()
-            });
+            let slot = Arc::new(Slot { place, ..Slot::default() });
             let writer = Writer {
                 copy: target.copy,
                 slot: Arc::clone(&slot),
@@ -172,28 +175,29 @@ impl Copies {
                 written: target.written,
             };
             let stop = supervisor.shutdown_token();
-            supervisor.spawn(format!("copy to {}", slot.place), TaskPolicy::Essential, async move {
-                tokio::select! {
-                    () = writer.run() => {}
-                    () = stop.cancelled() => {}
-                }
-            });
+            supervisor.spawn(
+                format!("copy to {}", slot.place),
+                TaskPolicy::Essential,
+                async move {
+                    tokio::select! {
+                        () = writer.run() => {}
+                        () = stop.cancelled() => {}
+                    }
+                },
+            );
             slot
         };
-        Self {
-            slots: targets.into_iter().map(start).collect(),
-            owed: Arc::default(),
-            answers,
-        }
+        Self { slots: targets.into_iter().map(start).collect(), owed: Arc::default(), answers }
     }
 
-    /// Says whether the main service answers: what a copy holds that is newer than what is served is read only while it does not.
+    /// Says whether the main service answers: what a copy holds that is newer than what is served
+    /// is read only while it does not.
     pub fn set_main_answers(&self, answers: bool) {
-        self.answers
-            .send_if_modified(|before| std::mem::replace(before, answers) != answers);
+        self.answers.send_if_modified(|before| std::mem::replace(before, answers) != answers);
     }
 
-    /// Says whether something is known that is to be stored later: until then no copy counts as current.
+    /// Says whether something is known that is to be stored later: until then no copy counts as
+    /// current.
     pub fn owe(&self, is_owed: bool) {
         self.owed.store(is_owed, Ordering::Release);
     }
@@ -212,7 +216,8 @@ impl Copies {
         }
     }
 
-    /// Waits until every copy holds what was stored before, at most so long. Gives whether they do. Those that rest are woken.
+    /// Waits until every copy holds what was stored before, at most so long. Gives whether they do.
+    /// Those that rest are woken.
     pub async fn flush(&self, limit: Duration) -> bool {
         let all = async {
             self.hurry();
@@ -232,10 +237,7 @@ impl Copies {
         let is_owed = self.owed.load(Ordering::Acquire);
         let counts = self.slots.iter().map(|slot| slot.counts());
         counts
-            .map(|counts| Counts {
-                is_current: counts.is_current && !is_owed,
-                ..counts
-            })
+            .map(|counts| Counts { is_current: counts.is_current && !is_owed, ..counts })
             .collect()
     }
 }
@@ -261,7 +263,8 @@ impl Writer {
             if !self.is_read {
                 self.read(false).await;
             }
-            // While the main service answers it tells the same, and a worker that is always second would read all for each change.
+            // While the main service answers it tells the same, and a worker that is always second
+            // would read all for each change.
             if self.is_overtaken && !*self.main_answers.borrow_and_update() {
                 self.read(true).await;
             }
@@ -275,8 +278,8 @@ impl Writer {
         }
     }
 
-    /// Reads what is there, as soon as that can be done, and has it taken into account: it may be newer than what is served,
-    /// and then is not to be written over.
+    /// Reads what is there, as soon as that can be done, and has it taken into account: it may be
+    /// newer than what is served, and then is not to be written over.
     async fn read(&mut self, is_of_another: bool) {
         loop {
             match self.copy.load().await {
@@ -285,12 +288,7 @@ impl Writer {
                     self.recovered();
                     let (taken, is_taken) = oneshot::channel();
                     let place = self.slot.place.clone();
-                    let found = Found {
-                        place,
-                        loaded,
-                        is_of_another,
-                        taken,
-                    };
+                    let found = Found { place, loaded, is_of_another, taken };
                     // Nobody is there only at the end.
                     let _ = self.found.send(found).await;
                     let _ = is_taken.await;
@@ -333,7 +331,8 @@ impl Writer {
                 let most = if is_small { SMALL.1 } else { REST_BOUNDS.1 };
                 self.pause((began.elapsed() * REST).clamp(REST_BOUNDS.0, most)).await;
             }
-            // Another process of this layer writes it and has newer documents; notes of this one come with its next write.
+            // Another process of this layer writes it and has newer documents; notes of this one
+            // come with its next write.
             Err(CopyError::Newer { .. }) => {
                 self.slot.done.send_replace(number);
             }
@@ -358,12 +357,9 @@ impl Writer {
         let Some(written) = self.written.as_ref().filter(|_| !next.has_changed) else {
             return false;
         };
-        let age_ms = next
-            .position
-            .as_of
-            .as_millis()
-            .saturating_sub(written.as_of.as_millis());
-        let is_same = (&written.store_id, written.revision) == (&next.position.store_id, next.position.revision);
+        let age_ms = next.position.as_of.as_millis().saturating_sub(written.as_of.as_millis());
+        let is_same = (&written.store_id, written.revision)
+            == (&next.position.store_id, next.position.revision);
         is_same && u128::from(age_ms.unsigned_abs()) < MAX_AGE.as_millis()
     }
 

@@ -4,10 +4,7 @@ use super::*;
 
 /// With a copy that could not be read at the start, which holds this.
 fn unread(held: Loaded) -> (Fixture, mpsc::Receiver<Found>) {
-    let fake = Fake {
-        is_away: true.into(),
-        ..Fake::new("fake")
-    };
+    let fake = Fake { is_away: true.into(), ..Fake::new("fake") };
     *fake.held.lock() = Some(held);
     let (find, found) = mpsc::channel(1);
     let fixture = Fixture::new(fake, false, &find);
@@ -21,9 +18,7 @@ async fn a_copy_that_could_not_be_read_is_read_before_it_is_written() {
     assert!(!fixture.copies.flush(Duration::from_secs(5)).await);
     assert!(fixture.copies.counts()[0].failed >= 3 && found.try_recv().is_err());
     fixture.fake.is_away.store(false, Ordering::Relaxed);
-    let Found {
-        place, loaded, taken, ..
-    } = found.recv().await.unwrap();
+    let Found { place, loaded, taken, .. } = found.recv().await.unwrap();
     assert_eq!((place.as_str(), loaded.position), ("fake", position(5)));
     assert!(
         !fixture.copies.flush(Duration::from_secs(60)).await,

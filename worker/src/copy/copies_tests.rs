@@ -16,11 +16,7 @@ const LONG: Duration = Duration::from_secs(300);
 
 fn target(copy: &Arc<Fake>, is_read: bool) -> Target {
     let copy = Arc::clone(copy) as Arc<dyn LocalCopy>;
-    Target {
-        copy,
-        is_read,
-        written: None,
-    }
+    Target { copy, is_read, written: None }
 }
 
 struct Fixture {
@@ -82,10 +78,7 @@ impl Fixture {
 
 #[tokio::test(start_paused = true)]
 async fn a_slow_copy_gets_the_newest_state() {
-    let slow = Fake {
-        permits: Semaphore::new(0),
-        ..Fake::new("slow")
-    };
+    let slow = Fake { permits: Semaphore::new(0), ..Fake::new("slow") };
     let mut fixture = Fixture::read(slow);
     fixture.put("a", 1);
     fixture.fake.called.notified().await;
@@ -121,10 +114,7 @@ async fn a_copy_that_comes_back_gets_everything() {
 #[tokio::test(start_paused = true)]
 async fn a_copy_that_is_away_does_not_hold_up_another_one() {
     let supervisor = Supervisor::new("test");
-    let away = Arc::new(Fake {
-        permits: Semaphore::new(0),
-        ..Fake::new("away")
-    });
+    let away = Arc::new(Fake { permits: Semaphore::new(0), ..Fake::new("away") });
     let good = Arc::new(Fake::new("good"));
     let targets = vec![target(&away, true), target(&good, true)];
     let copies = Copies::start(&supervisor, targets, &mpsc::channel(1).0);
@@ -158,10 +148,7 @@ async fn a_copy_rests_after_a_write_and_is_woken_in_the_end() {
 
 #[tokio::test(start_paused = true)]
 async fn a_small_copy_rests_shortly_and_an_urgent_state_does_not_wait() {
-    let slow = Fake {
-        permits: Semaphore::new(0),
-        ..Fake::new("slow")
-    };
+    let slow = Fake { permits: Semaphore::new(0), ..Fake::new("slow") };
     let mut fixture = Fixture::read(slow);
     fixture.put("a", 1);
     tokio::time::sleep(Duration::from_secs(5)).await;
@@ -181,10 +168,7 @@ async fn a_small_copy_rests_shortly_and_an_urgent_state_does_not_wait() {
 async fn a_copy_that_is_current_at_the_start_is_not_written() {
     for (written, writes) in [(position(5), 0), (position(4), 1)] {
         let (supervisor, fake) = (Supervisor::new("test"), Arc::new(Fake::new("file")));
-        let target = Target {
-            written: Some(written),
-            ..target(&fake, true)
-        };
+        let target = Target { written: Some(written), ..target(&fake, true) };
         let copies = Copies::start(&supervisor, vec![target], &mpsc::channel(1).0);
         copies.store(&Update {
             position: position(5),
@@ -239,8 +223,11 @@ fn any_act() -> impl Strategy<Value = Act> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]
-    fn whatever_happens_the_copy_ends_with_the_newest_state(acts in prop::collection::vec(any_act(), 0..30)) {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build().unwrap();
+    fn whatever_happens_the_copy_ends_with_the_newest_state(acts in prop::collection::vec(any_act(),
+        0..30)) {
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()
+            .unwrap();
         runtime.block_on(async {
             let mut fixture = Fixture::read(Fake::new("fake"));
             for (revision, act) in (1..).zip(acts) {

@@ -6,9 +6,9 @@
 //!        └── DefaultsWatch: reads it again when they change; a faulty file changes nothing but the status
 //! ```
 //!
-//! Documents have revision 0, for no store gave them one. Roll-outs are left out: nobody would watch over their gate. What a
-//! secret's text is does not count in the hash of a configuration, its version does: a file in which only a text changes
-//! changes no hash.
+//! Documents have revision 0, for no store gave them one. Roll-outs are left out: nobody would
+//! watch over their gate. What a secret's text is does not count in the hash of a configuration,
+//! its version does: a file in which only a text changes changes no hash.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -22,7 +22,9 @@ use std::time::Duration;
 use blaze_domain::LayerName;
 use blaze_domain::config::placement::placement;
 use blaze_domain::config::state::State;
-use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_DOCUMENT_BYTES, MAX_DOCUMENTS, Timestamp, spec};
+use blaze_domain::config::{
+    Code, Document, FieldFault, Key, Kind, MAX_DOCUMENT_BYTES, MAX_DOCUMENTS, Timestamp, spec,
+};
 use blaze_runtime::config::{Place, yaml_documents};
 use blaze_runtime::{Supervisor, TaskPolicy};
 use serde_json::Value;
@@ -80,10 +82,7 @@ pub fn read(path: &Path, layer: &LayerName) -> Result<Defaults, DefaultsError> {
         return Err(one(format!("has more than {MAX_BYTES} bytes")));
     }
     let text = String::from_utf8(bytes).map_err(|error| {
-        let good = error
-            .as_bytes()
-            .get(..error.utf8_error().valid_up_to())
-            .unwrap_or_default();
+        let good = error.as_bytes().get(..error.utf8_error().valid_up_to()).unwrap_or_default();
         let line = 1 + good.iter().filter(|byte| **byte == b'\n').count();
         DefaultsError(vec![format!("{name}:{line}: is not UTF-8")])
     })?;
@@ -99,14 +98,13 @@ fn parse(text: &str, name: &str) -> Result<BTreeMap<Key, Document>, DefaultsErro
     let values = yaml_documents(text, MAX_DOCUMENTS).map_err(|faults| {
         let place = |place: &Place| match place {
             Place::Line(line) | Place::File { line, .. } => format!("{name}:{line}"),
-            Place::Nowhere | Place::Overlay { .. } | Place::Environment(_) | Place::Override(_) => name.to_owned(),
+            Place::Nowhere | Place::Overlay { .. } | Place::Environment(_) | Place::Override(_) => {
+                name.to_owned()
+            }
         };
         let told = faults.iter().take(MAX_FAULTS).map(|fault| {
-            let path = if fault.path.is_empty() {
-                String::new()
-            } else {
-                format!("{}: ", fault.path)
-            };
+            let path =
+                if fault.path.is_empty() { String::new() } else { format!("{}: ", fault.path) };
             format!("{}: {path}{}", place(&fault.place), fault.detail)
         });
         DefaultsError(told.collect())
@@ -116,7 +114,9 @@ fn parse(text: &str, name: &str) -> Result<BTreeMap<Key, Document>, DefaultsErro
     for (number, value) in (1_usize..).zip(values.into_iter().flat_map(listed)) {
         let place = format!("{name} (document {number})");
         match document(value) {
-            Err(found) => faults.extend(found.iter().map(|fault| format!("{place}: {}", told(fault)))),
+            Err(found) => {
+                faults.extend(found.iter().map(|fault| format!("{place}: {}", told(fault))))
+            }
             Ok(document) => {
                 let key = document.key.clone();
                 if documents.insert(key.clone(), document).is_some() {
@@ -126,18 +126,16 @@ fn parse(text: &str, name: &str) -> Result<BTreeMap<Key, Document>, DefaultsErro
         }
     }
     faults.truncate(MAX_FAULTS);
-    if faults.is_empty() {
-        Ok(documents)
-    } else {
-        Err(DefaultsError(faults))
-    }
+    if faults.is_empty() { Ok(documents) } else { Err(DefaultsError(faults)) }
 }
 
 /// A list of documents in one YAML document counts as its entries.
 fn listed(value: Value) -> Vec<Value> {
     match value {
         Value::Array(items) => items,
-        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Object(_) => vec![value],
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Object(_) => {
+            vec![value]
+        }
     }
 }
 
@@ -157,12 +155,7 @@ fn document(value: Value) -> Result<Document, Vec<FieldFault>> {
     if envelope.delete {
         faults.push(fault("/delete", "deletes nothing here: leave the document out"));
     }
-    faults.extend(spec::check(
-        &key,
-        &envelope.labels,
-        &envelope.annotations,
-        &envelope.spec,
-    ));
+    faults.extend(spec::check(&key, &envelope.labels, &envelope.annotations, &envelope.spec));
     let size = spec::document_size(&envelope.labels, &envelope.annotations, &envelope.spec);
     if size > MAX_DOCUMENT_BYTES {
         let detail = format!("has {size} bytes, at most {MAX_DOCUMENT_BYTES} are allowed");
@@ -205,10 +198,7 @@ fn in_view(mut documents: BTreeMap<Key, Document>, layer: &LayerName) -> Default
         .filter(|document| placement(&state, document).visible.contains(layer))
         .map(Arc::clone)
         .collect();
-    Defaults {
-        left_out: all - documents.len(),
-        documents,
-    }
+    Defaults { left_out: all - documents.len(), documents }
 }
 
 /// What is known of the file.
@@ -220,8 +210,8 @@ pub struct Status {
     pub problem: Option<DefaultsError>,
 }
 
-/// Reads the file now, and again whenever it changes: within a second of the change, also when Kubernetes swaps the link
-/// that it lies behind. The task ends with the supervisor.
+/// Reads the file now, and again whenever it changes: within a second of the change, also when
+/// Kubernetes swaps the link that it lies behind. The task ends with the supervisor.
 #[must_use]
 pub fn watch_file(
     supervisor: &Supervisor,
@@ -231,12 +221,7 @@ pub fn watch_file(
 ) -> watch::Receiver<Status> {
     let (tell, told) = watch::channel(Status::default());
     let stop = supervisor.shutdown_token();
-    let watched = Watched {
-        path,
-        layer,
-        period,
-        tell,
-    };
+    let watched = Watched { path, layer, period, tell };
     supervisor.spawn("watch of the mounted file", TaskPolicy::Essential, async move {
         tokio::select! {
             () = watched.run() => {}
@@ -253,8 +238,8 @@ struct Watched {
     tell: watch::Sender<Status>,
 }
 
-/// What tells two states of a file apart: where it really is, device, inode, size, and time in seconds and nanoseconds.
-/// None: it is not there.
+/// What tells two states of a file apart: where it really is, device, inode, size, and time in
+/// seconds and nanoseconds. None: it is not there.
 type Look = Option<(PathBuf, [u64; 3], (i64, i64))>;
 
 impl Watched {
@@ -320,7 +305,11 @@ impl Watched {
                 let is_new = status.problem.as_ref() != Some(&error);
                 if is_new {
                     let has_older = status.current.is_some();
-                    tracing::error!(%error, has_older, "the mounted file is not used; what it said before stays");
+                    tracing::error!(
+                        %error,
+                        has_older,
+                        "the mounted file is not used; what it said before stays",
+                    );
                     status.problem = Some(error);
                 }
                 is_new

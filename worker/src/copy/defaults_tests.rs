@@ -56,11 +56,7 @@ fn write(folder: &TempDir, text: &str) -> PathBuf {
 }
 
 fn names(defaults: &Defaults) -> Vec<String> {
-    defaults
-        .documents
-        .iter()
-        .map(|document| document.key.to_string())
-        .collect()
+    defaults.documents.iter().map(|document| document.key.to_string()).collect()
 }
 
 const SEEN: [&str; 4] = ["Layer/edge", "Node/robot-1", "Service/slam", "Instance/slam/0"];
@@ -106,17 +102,11 @@ delete: true
 - { kind: Service, name: a, spec: {} }
 ";
     let DefaultsError(faults) = read(&write(&folder, text), &layer()).unwrap_err();
-    for (number, said) in [
-        (1, "/spec/kind"),
-        (2, "/name"),
-        (3, "/spec/config/a"),
-        (4, "/delete"),
-        (6, "twice"),
-    ] {
+    for (number, said) in
+        [(1, "/spec/kind"), (2, "/name"), (3, "/spec/config/a"), (4, "/delete"), (6, "twice")]
+    {
         let place = format!("defaults.yaml (document {number}): ");
-        let found = faults
-            .iter()
-            .any(|fault| fault.contains(&place) && fault.contains(said));
+        let found = faults.iter().any(|fault| fault.contains(&place) && fault.contains(said));
         assert!(found, "{number} {said}: {faults:#?}");
     }
     assert!(!format!("{faults:?}").contains("canary-5f1c"));
@@ -161,7 +151,8 @@ async fn a_config_map_that_is_swapped_is_read_again() {
     symlink("..one", path("..data")).unwrap();
     symlink("..data/defaults.yaml", path("defaults.yaml")).unwrap();
     let supervisor = Supervisor::new("test");
-    let mut told = watch_file(&supervisor, path("defaults.yaml"), layer(), Duration::from_millis(20));
+    let mut told =
+        watch_file(&supervisor, path("defaults.yaml"), layer(), Duration::from_millis(20));
     wait(&mut told, |status| has(status, "Service/slam")).await;
     symlink("..two", path("..data_tmp")).unwrap();
     fs::rename(path("..data_tmp"), path("..data")).unwrap();

@@ -2,7 +2,8 @@
 
 use blaze_domain::LayerName;
 
-/// Why a copy is not read or written. `place` is what [`LocalCopy::describe`](super::LocalCopy::describe) says.
+/// Why a copy is not read or written. `place` is what
+/// [`LocalCopy::describe`](super::LocalCopy::describe) says.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CopyError {
     /// It does not answer, or the disk is full: later it may.
@@ -60,7 +61,9 @@ pub enum CopyError {
         known: u64,
     },
     /// It holds a later state of the same store, which nothing older replaces.
-    #[error("{place} is at revision {held} of this store, so that {offered} is not written over it")]
+    #[error(
+        "{place} is at revision {held} of this store, so that {offered} is not written over it"
+    )]
     Newer {
         /// Which copy.
         place: String,
@@ -87,11 +90,15 @@ pub enum CopyError {
 }
 
 impl CopyError {
-    /// Whether what is there can be read by nobody here, so that it is moved aside before something else is written.
+    /// Whether what is there can be read by nobody here, so that it is moved aside before something
+    /// else is written.
     #[must_use]
     pub fn is_unreadable(&self) -> bool {
         match self {
-            Self::Broken { .. } | Self::OtherKey { .. } | Self::OtherLayer { .. } | Self::NewerFormat { .. } => true,
+            Self::Broken { .. }
+            | Self::OtherKey { .. }
+            | Self::OtherLayer { .. }
+            | Self::NewerFormat { .. } => true,
             Self::Away { .. }
             | Self::Refused { .. }
             | Self::Newer { .. }

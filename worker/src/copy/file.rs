@@ -6,8 +6,9 @@
 //!                                                              └─▶ last-known-good.broken, the newest one
 //! ```
 //!
-//! Reading changes nothing: a worker that was started with the wrong key finds its file when it is started with the right
-//! one. Only the first write moves an unreadable file away. A later revision of the same store stays.
+//! Reading changes nothing: a worker that was started with the wrong key finds its file when it is
+//! started with the right one. Only the first write moves an unreadable file away. A later revision
+//! of the same store stays.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read as _, Write as _};
@@ -43,12 +44,7 @@ impl FileCopy {
     /// In this folder, which must exist.
     #[must_use]
     pub fn new(folder: &Path, layer: LayerName, vault: Vault) -> Self {
-        let inner = Inner {
-            path: folder.join(FILE_NAME),
-            layer,
-            vault,
-            known: Mutex::default(),
-        };
+        let inner = Inner { path: folder.join(FILE_NAME), layer, vault, known: Mutex::default() };
         Self { inner: Arc::new(inner) }
     }
 
@@ -61,10 +57,7 @@ impl FileCopy {
         let place = inner.place();
         let done = tokio::task::spawn_blocking(move || work(&inner)).await;
         done.unwrap_or_else(|_| {
-            Err(CopyError::Away {
-                place,
-                detail: "the process is about to end".to_owned(),
-            })
+            Err(CopyError::Away { place, detail: "the process is about to end".to_owned() })
         })
     }
 }
@@ -93,9 +86,9 @@ impl Inner {
     fn failed(&self, error: &io::Error) -> CopyError {
         let (place, detail) = (self.place(), error.to_string());
         match error.kind() {
-            io::ErrorKind::PermissionDenied | io::ErrorKind::NotFound | io::ErrorKind::ReadOnlyFilesystem => {
-                CopyError::Refused { place, detail }
-            }
+            io::ErrorKind::PermissionDenied
+            | io::ErrorKind::NotFound
+            | io::ErrorKind::ReadOnlyFilesystem => CopyError::Refused { place, detail },
             _ => CopyError::Away { place, detail },
         }
     }
@@ -140,8 +133,7 @@ impl Inner {
         if let Some(held) = &*known {
             held.check_replaced_by(&whole.position, &self.place())?;
         }
-        self.replace_content(&content, is_unreadable)
-            .map_err(|error| self.failed(&error))?;
+        self.replace_content(&content, is_unreadable).map_err(|error| self.failed(&error))?;
         *known = Some(whole.position.clone());
         Ok(())
     }

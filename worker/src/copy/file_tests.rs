@@ -16,9 +16,8 @@ fn copy(folder: &TempDir, vault: Vault) -> FileCopy {
 
 fn names(folder: &TempDir) -> Vec<String> {
     let entries = fs::read_dir(folder.path()).unwrap();
-    let mut names: Vec<String> = entries
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
+    let mut names: Vec<String> =
+        entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();
     names
 }
@@ -32,10 +31,7 @@ async fn only_its_owner_reads_it_and_nothing_else_is_left() {
     fs::write(folder.path().join("last-known-good.new"), "rest").unwrap();
     file.replace(&loaded(7, [service("slam", 7, json!({}))])).await.unwrap();
     assert_eq!(names(&folder), [FILE_NAME]);
-    let mode = fs::metadata(folder.path().join(FILE_NAME))
-        .unwrap()
-        .permissions()
-        .mode();
+    let mode = fs::metadata(folder.path().join(FILE_NAME)).unwrap().permissions().mode();
     assert_eq!(mode & 0o777, 0o600);
 }
 

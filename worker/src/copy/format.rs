@@ -6,9 +6,9 @@
 //! {"kind":"Layer","name":"edge",…}                               documents, one a line
 //! ```
 //!
-//! With a key, `encryption` names it and the salt, and everything after the first line is encrypted and bound to the first
-//! line. Without a key the texts of secrets are left out. The hash is there for copies without a key: it detects a disk that
-//! fails, not a person who changes both.
+//! With a key, `encryption` names it and the salt, and everything after the first line is encrypted
+//! and bound to the first line. Without a key the texts of secrets are left out. The hash is there
+//! for copies without a key: it detects a disk that fails, not a person who changes both.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -60,10 +60,9 @@ pub(super) fn encode(whole: &Loaded, vault: &Vault) -> Result<Vec<u8>, CopyError
     let header = as_line(&Header {
         position: whole.position.clone(),
         documents: whole.documents.len(),
-        encryption: vault.key_id().map(|id| Encryption {
-            key: id.to_owned(),
-            salt: STANDARD.encode(salt),
-        }),
+        encryption: vault
+            .key_id()
+            .map(|id| Encryption { key: id.to_owned(), salt: STANDARD.encode(salt) }),
     });
     vault.encrypt(&salt, &header, &mut body)?;
     let mut out = format!("{MAGIC} {FORMAT} {} ", hash(&header, &body)).into_bytes();
@@ -87,7 +86,8 @@ impl Write for Texts<'_> {
     }
 }
 
-/// Nothing that is written here can fail: names of members are texts, and a vector takes everything.
+/// Nothing that is written here can fail: names of members are texts, and a vector takes
+/// everything.
 fn as_line(value: &impl Serialize) -> Vec<u8> {
     let mut line = serde_json::to_vec(value).unwrap_or_default();
     line.push(b'\n');
@@ -106,14 +106,19 @@ fn hash(header: &[u8], body: &[u8]) -> String {
 /// Reads a copy.
 ///
 /// # Errors
-/// [`CopyError::Broken`], [`CopyError::OtherKey`], [`CopyError::OtherLayer`], [`CopyError::NewerFormat`].
-pub(super) fn decode(content: &[u8], place: &str, layer: &LayerName, vault: &Vault) -> Result<Loaded, CopyError> {
-    let broken = |detail: &str| CopyError::Broken {
-        place: place.to_owned(),
-        detail: detail.to_owned(),
-    };
+/// [`CopyError::Broken`], [`CopyError::OtherKey`], [`CopyError::OtherLayer`],
+/// [`CopyError::NewerFormat`].
+pub(super) fn decode(
+    content: &[u8],
+    place: &str,
+    layer: &LayerName,
+    vault: &Vault,
+) -> Result<Loaded, CopyError> {
+    let broken =
+        |detail: &str| CopyError::Broken { place: place.to_owned(), detail: detail.to_owned() };
     let (first, body) = open_envelope(content, place)?;
-    let header: Header = json::read(first).map_err(|detail| broken(&format!("its first line {detail}")))?;
+    let header: Header =
+        json::read(first).map_err(|detail| broken(&format!("its first line {detail}")))?;
     if header.position.layer != *layer {
         return Err(CopyError::OtherLayer {
             place: place.to_owned(),
@@ -123,7 +128,8 @@ pub(super) fn decode(content: &[u8], place: &str, layer: &LayerName, vault: &Vau
     }
     let mut body = Zeroizing::new(body.to_vec());
     if let Some(Encryption { key, salt }) = header.encryption {
-        let salt: Option<[u8; SALT_BYTES]> = STANDARD.decode(salt).ok().and_then(|salt| salt.try_into().ok());
+        let salt: Option<[u8; SALT_BYTES]> =
+            STANDARD.decode(salt).ok().and_then(|salt| salt.try_into().ok());
         let salt = salt.ok_or_else(|| broken("its encryption has another form"))?;
         if vault.key_id() != Some(key.as_str()) {
             return Err(CopyError::OtherKey {
@@ -141,10 +147,8 @@ pub(super) fn decode(content: &[u8], place: &str, layer: &LayerName, vault: &Vau
 
 /// The first line from its JSON on, with its end, and what follows; the hash is right.
 fn open_envelope<'c>(content: &'c [u8], place: &str) -> Result<(&'c [u8], &'c [u8]), CopyError> {
-    let broken = |detail: &str| CopyError::Broken {
-        place: place.to_owned(),
-        detail: detail.to_owned(),
-    };
+    let broken =
+        |detail: &str| CopyError::Broken { place: place.to_owned(), detail: detail.to_owned() };
     let first = content.iter().take(MAX_HEADER_BYTES).position(|byte| *byte == b'\n');
     let end = first.ok_or_else(|| broken("it has no first line"))? + 1;
     let (line, body) = content.split_at(end);
@@ -157,11 +161,7 @@ fn open_envelope<'c>(content: &'c [u8], place: &str) -> Result<(&'c [u8], &'c [u
     match format {
         Some(FORMAT) => {}
         Some(found) if found > FORMAT => {
-            return Err(CopyError::NewerFormat {
-                place: place.to_owned(),
-                found,
-                known: FORMAT,
-            });
+            return Err(CopyError::NewerFormat { place: place.to_owned(), found, known: FORMAT });
         }
         Some(_) | None => return Err(broken("its format is not read any more")),
     }
@@ -175,20 +175,18 @@ fn open_envelope<'c>(content: &'c [u8], place: &str) -> Result<(&'c [u8], &'c [u
 fn read_body(body: &[u8], position: Position, count: usize) -> Result<Loaded, String> {
     let body = body.strip_suffix(b"\n").ok_or("it does not end with a line")?;
     let mut lines = body.split(|byte| *byte == b'\n');
-    let notes: Notes = json::read(lines.next().unwrap_or_default()).map_err(|error| format!("notes: {error}"))?;
+    let notes: Notes =
+        json::read(lines.next().unwrap_or_default()).map_err(|error| format!("notes: {error}"))?;
     let mut documents = Vec::new();
     for (number, line) in (1_usize..).zip(lines) {
-        let document = json::document(line).map_err(|error| format!("document {number}: {error}"))?;
+        let document =
+            json::document(line).map_err(|error| format!("document {number}: {error}"))?;
         documents.push(Arc::new(document));
     }
     if documents.len() != count {
         return Err(format!("it has {} documents of {count}", documents.len()));
     }
-    Ok(Loaded {
-        position,
-        documents,
-        notes: Arc::new(notes),
-    })
+    Ok(Loaded { position, documents, notes: Arc::new(notes) })
 }
 
 #[cfg(test)]
@@ -197,7 +195,9 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::copy::samples::{any_documents, any_notes, loaded, notes, position, service, with_secret};
+    use crate::copy::samples::{
+        any_documents, any_notes, loaded, notes, position, service, with_secret,
+    };
 
     const CANARY: &str = "canary-5f1c";
 
@@ -277,9 +277,7 @@ mod tests {
         let content = encode(&small(), &key()).unwrap();
         for vault in [Vault::default(), Vault::with_key([8; 32])] {
             let error = read(&content, &vault).unwrap_err();
-            let CopyError::OtherKey { found, own, .. } = error else {
-                panic!("{error}")
-            };
+            let CopyError::OtherKey { found, own, .. } = error else { panic!("{error}") };
             assert_eq!((Some(found.as_str()), own.as_deref()), (key().key_id(), vault.key_id()));
         }
         let error = decode(&content, "file x", &"fog".parse().unwrap(), &key()).unwrap_err();

@@ -1,7 +1,7 @@
 //! Documents of a copy from JSON, as [`Document::to_json`] writes them.
 //!
-//! What is read was written by this program, and may have been changed by anybody since: nothing is taken for granted, but
-//! the rules for what users write are not asked again.
+//! What is read was written by this program, and may have been changed by anybody since: nothing is
+//! taken for granted, but the rules for what users write are not asked again.
 
 use std::sync::Arc;
 
@@ -55,7 +55,8 @@ pub(super) fn document(text: &[u8]) -> Result<Document, String> {
 /// # Errors
 /// Where it has another form. Never repeats what is there, for it may be a secret.
 pub(super) fn read<T: DeserializeOwned>(text: &[u8]) -> Result<T, String> {
-    serde_json::from_slice(text).map_err(|error| format!("has another form at column {}", error.column()))
+    serde_json::from_slice(text)
+        .map_err(|error| format!("has another form at column {}", error.column()))
 }
 
 /// Times as they are written elsewhere.
@@ -63,11 +64,16 @@ pub(super) mod time {
     use blaze_domain::config::Timestamp;
     use serde::{Deserialize as _, Deserializer, Serializer, de};
 
-    pub(in crate::copy) fn serialize<S: Serializer>(time: &Timestamp, serializer: S) -> Result<S::Ok, S::Error> {
+    pub(in crate::copy) fn serialize<S: Serializer>(
+        time: &Timestamp,
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
         serializer.collect_str(time)
     }
 
-    pub(in crate::copy) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Timestamp, D::Error> {
+    pub(in crate::copy) fn deserialize<'de, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<Timestamp, D::Error> {
         String::deserialize(deserializer)?.parse().map_err(de::Error::custom)
     }
 }
@@ -83,7 +89,9 @@ mod tests {
     proptest! {
         #[test]
         fn what_is_cut_off_or_changed_is_no_reason_to_panic(
-            bytes in any_document().prop_flat_map(|document| any_bytes_of(document.to_json().to_string().into_bytes())),
+            bytes in any_document()
+                .prop_flat_map(|document| any_bytes_of(document.to_json().to_string()
+                .into_bytes())),
         ) {
             let _ = document(&bytes);
         }

@@ -1,5 +1,5 @@
-//! A process that writes the file is killed again and again, at no particular instant: what is found then
-//! is one revision, whole, and none that was said to be written is missing.
+//! A process that writes the file is killed again and again, at no particular instant: what is
+//! found then is one revision, whole, and none that was said to be written is missing.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -23,7 +23,9 @@ fn at(revision: u64) -> Loaded {
         notes: Arc::new(notes(&format!("uid-{revision}"), revision)),
         ..loaded(
             revision,
-            (0..40).map(|number| service(&format!("s{number}"), revision, json!({ "config": { "a": text } }))),
+            (0..40).map(|number| {
+                service(&format!("s{number}"), revision, json!({ "config": { "a": text } }))
+            }),
         )
     }
 }

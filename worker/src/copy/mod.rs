@@ -1,4 +1,5 @@
-//! The copy of the layer's view that outlives the process: one file, and a MongoDB where one is configured.
+//! The copy of the layer's view that outlives the process: one file, and a MongoDB where one is
+//! configured.
 //!
 //! ```text
 //!                      ┌─[newest state, coalesced]─▶ writer ──▶ FileCopy
@@ -9,15 +10,17 @@
 //! later:         a copy that could not be read at the start ──[Found]──▶ engine, before anything is written there
 //! ```
 //!
-//! Both hold the same bytes (module `format`). A write replaces the whole copy and is all or nothing: a process that dies
-//! during a write leaves the old content or the new content. A copy is never replaced by an older state of the same store.
-//! Serving never waits for a write. An unreadable file is moved aside by the first write; an unreadable copy in MongoDB is
-//! replaced, except one of a newer format.
+//! Both hold the same bytes (module `format`). A write replaces the whole copy and is all or
+//! nothing: a process that dies during a write leaves the old content or the new content. A copy is
+//! never replaced by an older state of the same store. Serving never waits for a write. An
+//! unreadable file is moved aside by the first write; an unreadable copy in MongoDB is replaced,
+//! except one of a newer format.
 //!
 //! # Secrets at rest
-//! With `worker.key_file` a copy is encrypted as a whole, but for its first line. Without a key the texts of secrets are
-//! left out and the versions stay ([`Vault`]): the configuration has the same hash, and the worker asks the main service
-//! for everything again to have the texts ([`Loaded::lacks_secrets`]).
+//! With `worker.key_file` a copy is encrypted as a whole, but for its first line. Without a key the
+//! texts of secrets are left out and the versions stay ([`Vault`]): the configuration has the same
+//! hash, and the worker asks the main service for everything again to have the texts
+//! ([`Loaded::lacks_secrets`]).
 
 #[cfg(test)]
 mod conformance;
@@ -74,7 +77,8 @@ pub struct Position {
 }
 
 impl Position {
-    /// Whether this one is to be preferred: of one store the later revision, of different stores the later time.
+    /// Whether this one is to be preferred: of one store the later revision, of different stores
+    /// the later time.
     #[must_use]
     pub fn is_newer_than(&self, other: &Self) -> bool {
         if self.store_id == other.store_id {
@@ -112,8 +116,8 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// Whether the text of a secret is not there: it was written without a key, or under another one. Who serves from this
-    /// asks the main service for a whole snapshot, not for what is new.
+    /// Whether the text of a secret is not there: it was written without a key, or under another
+    /// one. Who serves from this asks the main service for a whole snapshot, not for what is new.
     #[must_use]
     pub fn lacks_secrets(&self) -> bool {
         self.documents.iter().any(|document| {
@@ -155,8 +159,8 @@ pub trait LocalCopy: Send + Sync {
     /// Makes this the content, unless a later state of the same store is there.
     ///
     /// # Errors
-    /// [`CopyError::Newer`] for a later state; else [`CopyError`]: the old content is still there or, where the answer was
-    /// lost, the new content.
+    /// [`CopyError::Newer`] for a later state; else [`CopyError`]: the old content is still there
+    /// or, where the answer was lost, the new content.
     async fn replace(&self, whole: &Loaded) -> Result<(), CopyError>;
 
     /// What it is, for people: kind and place, no password.

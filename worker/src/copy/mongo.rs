@@ -6,10 +6,11 @@
 //! load      head ─▶ chunks of its generation ─▶ head again
 //! ```
 //!
-//! The head moves by one update of one document, which MongoDB does wholly or not at all, and only from the generation that
-//! was there before. So a write that reaches the server late changes nothing, and of two workers that write at once one
-//! tries again. Deleting only removes generations that no head names any more. Generations begin with the time, later than
-//! that of the head.
+//! The head moves by one update of one document, which MongoDB does wholly or not at all, and only
+//! from the generation that was there before. So a write that reaches the server late changes
+//! nothing, and of two workers that write at once one tries again. Deleting only removes
+//! generations that no head names any more. Generations begin with the time, later than that of the
+//! head.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -35,8 +36,8 @@ const LEFT_BEHIND: Duration = Duration::from_secs(600);
 /// How often the chunks are read again when the head moves meanwhile.
 const TRIES: usize = 3;
 
-/// The copy in a MongoDB. It is connected to at the first use. Several workers may share a database: each has a copy of its
-/// own, by layer and node.
+/// The copy in a MongoDB. It is connected to at the first use. Several workers may share a
+/// database: each has a copy of its own, by layer and node.
 pub struct MongoCopy {
     server: Server,
     copy: String,
@@ -57,7 +58,8 @@ impl MongoCopy {
         node: Option<&NodeName>,
         vault: Vault,
     ) -> Result<Self, CopyError> {
-        // Names have no dot and no slash: no two copies have one name, and no name begins as the chunks of another copy do.
+        // Names have no dot and no slash: no two copies have one name, and no name begins as the
+        // chunks of another copy do.
         let copy = node.map_or_else(|| layer.to_string(), |node| format!("{layer}.{node}"));
         let place = format!("MongoDB {database}, copy {copy}");
         Ok(Self {
@@ -69,8 +71,13 @@ impl MongoCopy {
         })
     }
 
-    /// The head record. `preference`: which members may answer; at the start also one that is not the primary.
-    async fn head(&self, tables: &Tables, preference: ReadPreference) -> Result<Option<Document>, CopyError> {
+    /// The head record. `preference`: which members may answer; at the start also one that is not
+    /// the primary.
+    async fn head(
+        &self,
+        tables: &Tables,
+        preference: ReadPreference,
+    ) -> Result<Option<Document>, CopyError> {
         let find = tables.head.find_one(doc! { "_id": &self.copy });
         self.server
             .limited(find.selection_criteria(SelectionCriteria::ReadPreference(preference)))
@@ -106,20 +113,25 @@ impl MongoCopy {
             let mut content = Vec::new();
             while let Some(chunk) = cursor.try_next().await? {
                 // What is missing or has another form does not fit the hash.
-                content.extend_from_slice(chunk.get_binary_generic("data").map_or(&[][..], |data| data));
+                content.extend_from_slice(
+                    chunk.get_binary_generic("data").map_or(&[][..], |data| data),
+                );
             }
             Ok(content)
         };
         self.server.limited(read).await
     }
 
-    async fn put_chunks(&self, tables: &Tables, generation: &str, content: &[u8]) -> Result<(), CopyError> {
+    async fn put_chunks(
+        &self,
+        tables: &Tables,
+        generation: &str,
+        content: &[u8],
+    ) -> Result<(), CopyError> {
         for (number, chunk) in content.chunks(CHUNK_BYTES).enumerate() {
-            let data = Binary {
-                subtype: BinarySubtype::Generic,
-                bytes: chunk.to_vec(),
-            };
-            let chunk = doc! { "_id": format!("{}/{generation}/{number:08x}", self.copy), "data": data };
+            let data = Binary { subtype: BinarySubtype::Generic, bytes: chunk.to_vec() };
+            let chunk =
+                doc! { "_id": format!("{}/{generation}/{number:08x}", self.copy), "data": data };
             self.server.limited(tables.chunks.insert_one(chunk)).await?;
         }
         Ok(())
@@ -133,10 +145,12 @@ impl MongoCopy {
         }
         let before = present.as_ref().and_then(|present| present.get("generation"));
         let generation = new_generation(now_ms(), before.and_then(Bson::as_str));
-        let old = now_ms().saturating_sub(u64::try_from(LEFT_BEHIND.as_millis()).unwrap_or(u64::MAX));
+        let old =
+            now_ms().saturating_sub(u64::try_from(LEFT_BEHIND.as_millis()).unwrap_or(u64::MAX));
         let left = of_left_behind(&self.copy, before.and_then(Bson::as_str), old);
         self.server.limited(tables.chunks.delete_many(left)).await?;
-        let put = tokio::time::timeout(CHUNKS_WITHIN, self.put_chunks(&tables, &generation, content));
+        let put =
+            tokio::time::timeout(CHUNKS_WITHIN, self.put_chunks(&tables, &generation, content));
         put.await.map_err(|_| CopyError::Away {
             place: self.place.clone(),
             detail: format!("not written within {} s", CHUNKS_WITHIN.as_secs()),
@@ -158,10 +172,7 @@ impl MongoCopy {
             Err(error) => return Err(self.server.failed(&error)),
         }
         let earlier = of_earlier(&self.copy, &generation);
-        self.server
-            .limited(tables.chunks.delete_many(earlier))
-            .await
-            .map(|_| ())
+        self.server.limited(tables.chunks.delete_many(earlier)).await.map(|_| ())
     }
 }
 
@@ -208,7 +219,8 @@ fn now_ms() -> u64 {
     u64::try_from(now.as_millis()).unwrap_or(0)
 }
 
-/// A generation that sorts behind those that began earlier. `after` is the present one, for clocks may go back.
+/// A generation that sorts behind those that began earlier. `after` is the present one, for clocks
+/// may go back.
 fn new_generation(now_ms: u64, after: Option<&str>) -> String {
     let known = after.and_then(|text| u64::from_str_radix(text.split('-').next()?, 16).ok());
     let start = known.map_or(now_ms, |known| now_ms.max(known.saturating_add(1)));
@@ -217,7 +229,8 @@ fn new_generation(now_ms: u64, after: Option<&str>) -> String {
 
 /// Filter for all chunks of a generation. `0` is the character after `/`.
 fn of_generation(copy: &str, generation: &str) -> Document {
-    doc! { "_id": { "$gte": format!("{copy}/{generation}/"), "$lt": format!("{copy}/{generation}0") } }
+    doc! { "_id": { "$gte": format!("{copy}/{generation}/"),
+    "$lt": format!("{copy}/{generation}0") } }
 }
 
 /// Filter for all chunks of earlier generations.
@@ -225,9 +238,11 @@ fn of_earlier(copy: &str, generation: &str) -> Document {
     doc! { "_id": { "$gte": format!("{copy}/"), "$lt": format!("{copy}/{generation}/") } }
 }
 
-/// Filter for the chunks of generations that began before this time, but for those that the head names.
+/// Filter for the chunks of generations that began before this time, but for those that the head
+/// names.
 fn of_left_behind(copy: &str, head: Option<&str>, before_ms: u64) -> Document {
-    let mut old = doc! { "_id": { "$gte": format!("{copy}/"), "$lt": format!("{copy}/{before_ms:016x}") } };
+    let mut old =
+        doc! { "_id": { "$gte": format!("{copy}/"), "$lt": format!("{copy}/{before_ms:016x}") } };
     if let Some(head) = head {
         let held = of_generation(copy, head);
         old.insert("$nor", vec![held]);

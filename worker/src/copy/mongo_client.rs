@@ -6,7 +6,9 @@ use std::time::Duration;
 use blaze_domain::node_file::SecretText;
 use mongodb::bson::Document;
 use mongodb::error::{Error, ErrorKind, WriteFailure};
-use mongodb::options::{ClientOptions, DatabaseOptions, ReadPreference, SelectionCriteria, WriteConcern};
+use mongodb::options::{
+    ClientOptions, DatabaseOptions, ReadPreference, SelectionCriteria, WriteConcern,
+};
 use mongodb::{Client, Collection};
 use tokio::sync::Mutex;
 
@@ -33,7 +35,8 @@ pub(crate) struct Server {
     tables: Mutex<Option<Tables>>,
 }
 
-/// Its collections. Writes count once a majority has them on disk; a server that is alone is its own majority.
+/// Its collections. Writes count once a majority has them on disk; a server that is alone is its
+/// own majority.
 #[derive(Clone)]
 pub(crate) struct Tables {
     pub(crate) head: Collection<Document>,
@@ -46,12 +49,20 @@ impl Server {
     ///
     /// # Errors
     /// [`CopyError::Refused`] for a name that no database can have.
-    pub(crate) fn new(uri: SecretText, database: &str, copy: &str, place: &str) -> Result<Self, CopyError> {
+    pub(crate) fn new(
+        uri: SecretText,
+        database: &str,
+        copy: &str,
+        place: &str,
+    ) -> Result<Self, CopyError> {
         let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
         if database.is_empty() || database.len() > NAME_BYTES || !database.chars().all(allowed) {
             return Err(CopyError::Refused {
                 place: "MongoDB".to_owned(),
-                detail: format!("{database:?} is no name of a database: 1 to {NAME_BYTES} of A-Z, a-z, 0-9, _ and -"),
+                detail: format!(
+                    "{database:?} is no name of a database: 1 to {NAME_BYTES} of A-Z, a-z, 0-9, _ \
+                     and -"
+                ),
             });
         }
         Ok(Self {

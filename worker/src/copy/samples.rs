@@ -44,11 +44,7 @@ pub(super) fn position(revision: u64) -> Position {
 pub(super) fn loaded(revision: u64, documents: impl IntoIterator<Item = Document>) -> Loaded {
     let mut documents: Vec<Arc<Document>> = documents.into_iter().map(Arc::new).collect();
     documents.sort_by(|one, other| one.key.cmp(&other.key));
-    Loaded {
-        position: position(revision),
-        documents,
-        notes: Arc::default(),
-    }
+    Loaded { position: position(revision), documents, notes: Arc::default() }
 }
 
 /// Notes with one failed roll-out and one place.
@@ -82,7 +78,8 @@ fn any_value() -> impl Strategy<Value = Value> {
         any::<i32>().prop_map(Value::from),
         prop::num::f64::NORMAL.prop_map(|number| Value::from(number % 1e12)),
         ".{0,8}".prop_map(Value::from),
-        (".{0,8}", 0_u64..9).prop_map(|(text, version)| json!({ "$secret": { "text": text, "version": version } })),
+        (".{0,8}", 0_u64..9)
+            .prop_map(|(text, version)| json!({ "$secret": { "text": text, "version": version } })),
         ".{0,8}".prop_map(|text| json!({ "$secret": text })),
     ];
     leaf.prop_recursive(4, 32, 4, |inner| {
@@ -99,7 +96,8 @@ fn any_key() -> impl Strategy<Value = Key> {
         "[a-c]{1,2}".prop_map(|name| format!("Layer/{name}")),
         "[a-c]{1,2}".prop_map(|name| format!("Node/{name}")),
         "[a-c]{1,2}".prop_map(|name| format!("Service/{name}")),
-        ("[a-c]{1,2}", "[a-c0-9]{1,2}").prop_map(|(service, name)| format!("Instance/{service}/{name}")),
+        ("[a-c]{1,2}", "[a-c0-9]{1,2}")
+            .prop_map(|(service, name)| format!("Instance/{service}/{name}")),
         "[a-c]{1,2}".prop_map(|name| format!("Rollout/{name}")),
     ]
     .prop_map(|text| text.parse().unwrap())
@@ -114,31 +112,23 @@ pub(super) fn any_document() -> impl Strategy<Value = Document> {
     let spec = prop::collection::btree_map("[a-d]{1,2}", any_value(), 0..4)
         .prop_map(|members| Value::Object(members.into_iter().collect()));
     let times = (0_i64..4_000_000_000_000, 0_i64..4_000_000_000_000);
-    let status = prop::option::of(any_value().prop_map(|value| json!({ "phase": "canary", "more": value })));
+    let status =
+        prop::option::of(any_value().prop_map(|value| json!({ "phase": "canary", "more": value })));
     let texts = ("[0-9a-f-]{0,36}", ".{0,12}");
-    (
-        any_key(),
-        texts,
-        0..1_u64 << 53,
-        times,
-        (any_labels(), any_labels()),
-        spec,
-        status,
+    (any_key(), texts, 0..1_u64 << 53, times, (any_labels(), any_labels()), spec, status).prop_map(
+        |(key, (uid, updated_by), revision, times, (labels, annotations), spec, status)| Document {
+            key,
+            uid,
+            revision,
+            create_time: Timestamp::from_millis(times.0),
+            update_time: Timestamp::from_millis(times.1),
+            updated_by,
+            labels,
+            annotations,
+            spec: Arc::new(spec),
+            status,
+        },
     )
-        .prop_map(
-            |(key, (uid, updated_by), revision, times, (labels, annotations), spec, status)| Document {
-                key,
-                uid,
-                revision,
-                create_time: Timestamp::from_millis(times.0),
-                update_time: Timestamp::from_millis(times.1),
-                updated_by,
-                labels,
-                annotations,
-                spec: Arc::new(spec),
-                status,
-            },
-        )
 }
 
 /// Documents of different keys, in their order.

@@ -1,6 +1,8 @@
-//! What the worker starts from: of one store the copy with the higher revision, of two stores the later one; notes of both.
+//! What the worker starts from: of one store the copy with the higher revision, of two stores the
+//! later one; notes of both.
 //!
-//! A copy that could not be read in time is read before it is first written ([`Target::is_read`], [`Found`](super::Found)).
+//! A copy that could not be read in time is read before it is first written ([`Target::is_read`],
+//! [`Found`](super::Found)).
 
 use std::pin::pin;
 use std::sync::Arc;
@@ -10,8 +12,8 @@ use tokio::time::timeout;
 
 use super::{CopyError, Loaded, LocalCopy, Target};
 
-/// How long the database is waited for where the file has something: services get their last configuration within two
-/// seconds, also while the database is away.
+/// How long the database is waited for where the file has something: services get their last
+/// configuration within two seconds, also while the database is away.
 const DATABASE_LIMIT: Duration = Duration::from_secs(1);
 /// The same where the file has nothing: then there is nothing to serve meanwhile.
 const PATIENT: u32 = 5;
@@ -28,7 +30,10 @@ pub struct Start {
 }
 
 /// Reads both copies at once and takes the newer one.
-pub async fn choose(file: Option<Arc<dyn LocalCopy>>, database: Option<Arc<dyn LocalCopy>>) -> Start {
+pub async fn choose(
+    file: Option<Arc<dyn LocalCopy>>,
+    database: Option<Arc<dyn LocalCopy>>,
+) -> Start {
     let mut start = Start::default();
     let load = |copy: Option<Arc<dyn LocalCopy>>| async move {
         match copy {
@@ -37,7 +42,8 @@ pub async fn choose(file: Option<Arc<dyn LocalCopy>>, database: Option<Arc<dyn L
         }
     };
     let mut asked = pin!(load(database.clone()));
-    let (of_file, in_time) = tokio::join!(load(file.clone()), timeout(DATABASE_LIMIT, asked.as_mut()));
+    let (of_file, in_time) =
+        tokio::join!(load(file.clone()), timeout(DATABASE_LIMIT, asked.as_mut()));
     if let Some(file) = file {
         start.take(file, of_file);
     }

@@ -20,10 +20,7 @@ fn unread(start: &Start) -> Vec<String> {
 }
 
 fn hanging(held: Loaded) -> Arc<dyn LocalCopy> {
-    let fake = Fake {
-        permits: Semaphore::new(0),
-        ..Fake::new("database")
-    };
+    let fake = Fake { permits: Semaphore::new(0), ..Fake::new("database") };
     *fake.held.lock() = Some(held);
     Arc::new(fake)
 }
@@ -35,10 +32,7 @@ async fn the_higher_revision_of_one_store_is_taken() {
         let file = Fake::with("file", at(in_file, "a"));
         let start = choose(Some(file), Some(database)).await;
         assert_eq!((start.from.as_deref(), unread(&start)), (Some(from), vec![]));
-        let written = start
-            .targets
-            .iter()
-            .map(|target| target.written.as_ref().unwrap().revision);
+        let written = start.targets.iter().map(|target| target.written.as_ref().unwrap().revision);
         assert_eq!(written.collect::<Vec<_>>(), [in_file, in_database]);
         assert_eq!(start.loaded.unwrap().position.revision, in_database.max(in_file));
     }
@@ -59,10 +53,7 @@ async fn a_database_that_does_not_answer_costs_one_second() {
 
 #[tokio::test(start_paused = true)]
 async fn without_a_file_a_slow_database_is_waited_for() {
-    let slow = Arc::new(Fake {
-        permits: Semaphore::new(0),
-        ..Fake::new("database")
-    });
+    let slow = Arc::new(Fake { permits: Semaphore::new(0), ..Fake::new("database") });
     *slow.held.lock() = Some(at(9, "a"));
     let database: Arc<dyn LocalCopy> = Arc::clone(&slow) as Arc<dyn LocalCopy>;
     let file: Arc<dyn LocalCopy> = Arc::new(Fake::new("file"));
@@ -96,24 +87,15 @@ async fn a_copy_that_cannot_be_read_is_told_and_the_other_one_is_taken() {
 
 #[tokio::test(start_paused = true)]
 async fn notes_of_both_survive() {
-    let with_notes = |revision, uid| Loaded {
-        notes: Arc::new(notes(uid, revision)),
-        ..at(revision, "a")
-    };
+    let with_notes =
+        |revision, uid| Loaded { notes: Arc::new(notes(uid, revision)), ..at(revision, "a") };
     for newer in [4, 6] {
         let database = Fake::with("database", with_notes(newer, "one"));
         let file = Fake::with("file", with_notes(5, "two"));
         let start = choose(Some(file), Some(database)).await;
         let found = start.loaded.as_ref().unwrap();
-        assert!(
-            ["one", "two"]
-                .iter()
-                .all(|uid| found.notes.failed.contains(&(*uid).to_owned()))
-        );
+        assert!(["one", "two"].iter().all(|uid| found.notes.failed.contains(&(*uid).to_owned())));
         assert_eq!(found.notes.floor, newer.max(5));
-        assert!(
-            start.targets.iter().all(|target| target.written.is_none()),
-            "both are behind"
-        );
+        assert!(start.targets.iter().all(|target| target.written.is_none()), "both are behind");
     }
 }

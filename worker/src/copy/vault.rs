@@ -1,7 +1,8 @@
 //! The key of the copies, `worker.key_file`.
 //!
-//! Each write of a copy has a key of its own, derived by HKDF-SHA256 from the key of the file and 32 random bytes. So no
-//! number of writes comes near the limit that random nonces of 96 bits would have.
+//! Each write of a copy has a key of its own, derived by HKDF-SHA256 from the key of the file and
+//! 32 random bytes. So no number of writes comes near the limit that random nonces of 96 bits would
+//! have.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -48,9 +49,8 @@ impl Vault {
         let Some(path) = key_file else {
             return Ok(Self::default());
         };
-        let wrong = |detail: String| CopyError::Key {
-            detail: format!("{} {detail}", path.display()),
-        };
+        let wrong =
+            |detail: String| CopyError::Key { detail: format!("{} {detail}", path.display()) };
         let found = read_small(path).map_err(|error| wrong(format!("cannot be read: {error}")))?;
         let text = Zeroizing::new(found.ok_or_else(|| wrong("is not there".to_owned()))?);
         let decoded = STANDARD.decode(text.trim_ascii()).map(Zeroizing::new);
@@ -68,9 +68,7 @@ impl Vault {
         let tag = hmac::sign(&hmac::Key::new(hmac::HMAC_SHA256, &bytes), FOR_ID);
         let id = tag.as_ref().iter().take(8).map(|byte| format!("{byte:02x}")).collect();
         let key = Zeroizing::new(bytes);
-        Self {
-            master: Some(Arc::new(Master { key, id })),
-        }
+        Self { master: Some(Arc::new(Master { key, id })) }
     }
 
     /// By what the key is known: nothing of it follows from this.
@@ -91,7 +89,12 @@ impl Vault {
     ///
     /// # Errors
     /// [`CopyError::Sealing`].
-    pub(super) fn encrypt(&self, salt: &[u8; SALT_BYTES], header: &[u8], body: &mut Vec<u8>) -> Result<(), CopyError> {
+    pub(super) fn encrypt(
+        &self,
+        salt: &[u8; SALT_BYTES],
+        header: &[u8],
+        body: &mut Vec<u8>,
+    ) -> Result<(), CopyError> {
         let Some(master) = &self.master else { return Ok(()) };
         make_room(body, TAG_BYTES);
         master
@@ -104,11 +107,14 @@ impl Vault {
     ///
     /// # Errors
     /// [`CopyError::Sealing`].
-    pub(super) fn decrypt(&self, salt: &[u8; SALT_BYTES], header: &[u8], body: &mut Vec<u8>) -> Result<(), CopyError> {
+    pub(super) fn decrypt(
+        &self,
+        salt: &[u8; SALT_BYTES],
+        header: &[u8],
+        body: &mut Vec<u8>,
+    ) -> Result<(), CopyError> {
         let master = self.master.as_ref().ok_or(CopyError::Sealing)?;
-        let opened = master
-            .derive(salt)?
-            .open_in_place(only_nonce(), Aad::from(header), body);
+        let opened = master.derive(salt)?.open_in_place(only_nonce(), Aad::from(header), body);
         let length = opened.map_err(|_| CopyError::Sealing)?.len();
         body.truncate(length);
         Ok(())
@@ -124,7 +130,8 @@ impl Master {
     }
 }
 
-/// Makes room for so many more bytes: a vector that grows by itself leaves texts behind in freed memory.
+/// Makes room for so many more bytes: a vector that grows by itself leaves texts behind in freed
+/// memory.
 pub(super) fn make_room(body: &mut Vec<u8>, more: usize) {
     if body.capacity() - body.len() < more {
         let mut room = Vec::with_capacity((body.len() + more).max(body.capacity() * 2));

@@ -46,8 +46,8 @@ pub enum Reply {
 
 /// Answers a request from what is served, and notes who asked.
 ///
-/// A service must exist; an instance, a node or a layer without document is one that says nothing, so that a service
-/// runs with what there is before anybody has written its node down.
+/// A service must exist; an instance, a node or a layer without document is one that says nothing,
+/// so that a service runs with what there is before anybody has written its node down.
 pub fn answer(served: &mut Served, request: &GetRequest, now: Instant) -> Reply {
     match standing(served, request, now) {
         Ok(standing) if request.hash.as_ref() == Some(&standing.hash) => Reply::Unchanged {
@@ -60,10 +60,15 @@ pub fn answer(served: &mut Served, request: &GetRequest, now: Instant) -> Reply 
     }
 }
 
-fn standing(served: &mut Served, request: &GetRequest, now: Instant) -> Result<Standing, RequestError> {
+fn standing(
+    served: &mut Served,
+    request: &GetRequest,
+    now: Instant,
+) -> Result<Standing, RequestError> {
     let node = node(served, request)?;
     if !served.is_ready() {
-        let detail = "no configuration is there yet: neither the main service nor a copy or file gave any";
+        let detail =
+            "no configuration is there yet: neither the main service nor a copy or file gave any";
         return Err(RequestError::new(ErrorCode::NotReady, detail));
     }
     let Some(service) = &request.service else {
@@ -74,11 +79,7 @@ fn standing(served: &mut Served, request: &GetRequest, now: Instant) -> Result<S
             node,
         }));
     };
-    let place = Place {
-        service: service.clone(),
-        instance: request.instance.clone(),
-        node,
-    };
+    let place = Place { service: service.clone(), instance: request.instance.clone(), node };
     match served.ask(&place, now) {
         Some(standing) => Ok(standing),
         None => {

@@ -14,11 +14,7 @@ fn served(node: Option<&str>) -> Served {
         document("Layer/edge", 1, json!({"config": {"log": "info"}})),
         document("Node/robot-1", 2, json!({"layer": "edge", "config": {"gpu": true}})),
         document("Service/slam", 3, json!({"config": {"rate_hz": 30}})),
-        document(
-            "Instance/slam/0",
-            4,
-            json!({"node": "robot-1", "config": {"rate_hz": 10}}),
-        ),
+        document("Instance/slam/0", 4, json!({"node": "robot-1", "config": {"rate_hz": 10}})),
     ];
     served.load(state(9, documents), Source::Copy);
     served.flush(Instant::now());
@@ -80,11 +76,7 @@ fn everybody_gets_what_counts_where_it_runs() {
         // With the hash that it has now there is nothing to tell.
         let mut again = asked.clone();
         again["hash"] = standing.hash.as_str().into();
-        let unchanged = Reply::Unchanged {
-            revision: 9,
-            hash: standing.hash,
-            source: Source::Copy,
-        };
+        let unchanged = Reply::Unchanged { revision: 9, hash: standing.hash, source: Source::Copy };
         assert_eq!(answer(&mut served, &request(&again), now), unchanged);
     }
 }
@@ -96,22 +88,14 @@ fn refusals_say_why() {
     let slam = request(&json!({"service": "slam", "instance": "0"}));
     assert_eq!(code(&answer(&mut empty, &slam, now)).0, ErrorCode::NotReady);
     let mut served = served(Some("robot-1"));
-    let reply = answer(
-        &mut served,
-        &request(&json!({"service": "slamm", "instance": "0"})),
-        now,
-    );
+    let reply = answer(&mut served, &request(&json!({"service": "slamm", "instance": "0"})), now);
     assert_eq!(
         code(&reply),
         (ErrorCode::NotFound, "no service slamm; did you mean slam?".to_owned())
     );
     let reply = answer(&mut served, &request(&json!({"service": "camera"})), now);
     assert_eq!(code(&reply), (ErrorCode::NotFound, "no service camera".to_owned()));
-    let reply = answer(
-        &mut served,
-        &request(&json!({"service": "slam", "node": "robot-2"})),
-        now,
-    );
+    let reply = answer(&mut served, &request(&json!({"service": "slam", "node": "robot-2"})), now);
     let (invalid, detail) = code(&reply);
     assert_eq!(invalid, ErrorCode::InvalidRequest);
     assert!(detail.starts_with("node: "), "{detail}");

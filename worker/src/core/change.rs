@@ -34,8 +34,8 @@ pub(super) fn difference(old: &State, new: &State) -> Vec<Key> {
     differing.cloned().collect()
 }
 
-/// A uid and a revision stand for one content, but only where the main service gave them: documents of a mounted file have
-/// none, and those of another store may have the same by chance.
+/// A uid and a revision stand for one content, but only where the main service gave them: documents
+/// of a mounted file have none, and those of another store may have the same by chance.
 fn is_same(one: Option<&Arc<Held>>, other: Option<&Arc<Held>>) -> bool {
     match (one, other) {
         (Some(one), Some(other)) => Arc::ptr_eq(one, other) || *one.document == *other.document,
@@ -68,14 +68,8 @@ mod tests {
                 document("Instance/slam/0", 9, json!({})),
             ],
         );
-        assert_eq!(
-            difference(&old, &new),
-            keys(["Node/a", "Service/slam", "Instance/slam/0"])
-        );
-        assert_eq!(
-            difference(&new, &old),
-            keys(["Node/a", "Service/slam", "Instance/slam/0"])
-        );
+        assert_eq!(difference(&old, &new), keys(["Node/a", "Service/slam", "Instance/slam/0"]));
+        assert_eq!(difference(&new, &old), keys(["Node/a", "Service/slam", "Instance/slam/0"]));
         assert!(difference(&old, &old.clone()).is_empty());
         assert_eq!(difference(&State::default(), &old).len(), 3);
     }

@@ -10,8 +10,8 @@
 //!                   more than max_unhealthy ──▶ failed: undone here, whoever else is there or not
 //! ```
 //!
-//! A window begins when the changed configuration was told here, by whomever; in a new life of the worker it begins anew. As
-//! long as nobody tells it, nobody has it.
+//! A window begins when the changed configuration was told here, by whomever; in a new life of the
+//! worker it begins anew. As long as nobody tells it, nobody has it.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -22,7 +22,8 @@ use super::health::{Complaint, Trouble};
 use super::place::Place;
 use super::served::{Served, Trial};
 
-/// Roll-outs times canary nodes that are watched, at most; beyond, canaries are served and not judged, and counted.
+/// Roll-outs times canary nodes that are watched, at most; beyond, canaries are served and not
+/// judged, and counted.
 pub const MAX_WINDOWS: usize = 10_000;
 /// Places that a reason names, at most.
 const MAX_NAMED: usize = 5;
@@ -80,7 +81,8 @@ pub struct Failure {
 struct Window {
     name: DocumentName,
     length: Duration,
-    /// Revision of the documents that it came with: what services were told of an earlier state does not open it.
+    /// Revision of the documents that it came with: what services were told of an earlier state
+    /// does not open it.
     since: u64,
     /// `None`: services were not told yet.
     until: Option<Instant>,
@@ -114,7 +116,8 @@ impl Gate {
                 let key = (node.clone(), trial.uid.clone());
                 let window = old.remove(&key);
                 // That it failed may become known later, from a copy.
-                let window = window.filter(|window| !trial.has_failed || window.phase != RolloutPhase::Applied);
+                let window = window
+                    .filter(|window| !trial.has_failed || window.phase != RolloutPhase::Applied);
                 let window = window.unwrap_or_else(|| {
                     is_changed = true;
                     Window::new(&trial, served.state().revision())
@@ -125,8 +128,8 @@ impl Gate {
         is_changed || !old.is_empty()
     }
 
-    /// Opens the windows of what services were told of by now: everything up to this revision. Gives whether the reports are
-    /// others.
+    /// Opens the windows of what services were told of by now: everything up to this revision.
+    /// Gives whether the reports are others.
     pub fn open(&mut self, told: Option<u64>, now: Instant) -> bool {
         let Some(told) = told else { return false };
         let mut is_changed = false;
@@ -139,8 +142,14 @@ impl Gate {
         is_changed
     }
 
-    /// Judges by a complaint. Gives the roll-outs that fail because of it: they are to be undone and remembered.
-    pub fn complain(&mut self, served: &Served, complaint: &Complaint, now: Instant) -> Vec<Failure> {
+    /// Judges by a complaint. Gives the roll-outs that fail because of it: they are to be undone
+    /// and remembered.
+    pub fn complain(
+        &mut self,
+        served: &Served,
+        complaint: &Complaint,
+        now: Instant,
+    ) -> Vec<Failure> {
         let mut failures = Vec::new();
         let place = &complaint.place;
         let Some(node) = &place.node else { return failures };
@@ -181,7 +190,8 @@ impl Gate {
         }
     }
 
-    /// How roll-outs go on nodes that are served here; those that failed come first, for the list may be cut.
+    /// How roll-outs go on nodes that are served here; those that failed come first, for the list
+    /// may be cut.
     #[must_use]
     pub fn states(&self, is_served: impl Fn(&NodeName) -> bool) -> Vec<RolloutState> {
         let here = self.windows.iter().filter(|((node, _), _)| is_served(node));
@@ -228,11 +238,7 @@ impl Window {
     }
 
     fn shown_phase(&self) -> RolloutPhase {
-        if self.is_untold() {
-            RolloutPhase::Pending
-        } else {
-            self.phase
-        }
+        if self.is_untold() { RolloutPhase::Pending } else { self.phase }
     }
 
     fn shown_reason(&self) -> String {

@@ -9,7 +9,8 @@ use super::*;
 
 fn rollout(target: &str, max_unhealthy: u64, phase: &str) -> Document {
     let spec = json!({"target": {"kind": "Service", "name": target}, "patch": {"config": {"rate_hz": 5}},
-        "canary": {"node_selector": "canary=true"}, "gate": {"window_s": 60, "max_unhealthy": max_unhealthy}});
+        "canary": {"node_selector": "canary=true"},
+        "gate": {"window_s": 60, "max_unhealthy": max_unhealthy}});
     let mut out = document(&format!("Rollout/{target}-slower"), 9, spec);
     out.status = Some(json!({ "phase": phase }));
     out
@@ -27,11 +28,7 @@ fn documents(rollouts: Vec<Document>) -> Vec<Document> {
         document("Instance/slam/0", 4, on("robot-1")),
         document("Instance/slam/1", 4, on("robot-1")),
         // What it says itself is stronger than what is tried.
-        document(
-            "Instance/slam/own",
-            4,
-            json!({"node": "robot-1", "config": {"rate_hz": 1}}),
-        ),
+        document("Instance/slam/own", 4, json!({"node": "robot-1", "config": {"rate_hz": 1}})),
         document("Instance/slam/2", 4, on("robot-2")),
     ];
     out.extend(rollouts);
@@ -54,13 +51,7 @@ fn world(node: Option<&str>, rollouts: Vec<Document>) -> World {
 }
 
 fn complaint(text: &str, trouble: Trouble) -> Complaint {
-    Complaint {
-        place: place(text),
-        trouble,
-        hash: None,
-        revision: None,
-        detail: String::new(),
-    }
+    Complaint { place: place(text), trouble, hash: None, revision: None, detail: String::new() }
 }
 
 impl World {
@@ -72,18 +63,12 @@ impl World {
     /// Node and phase of each, in order.
     fn phases(&self) -> Vec<(String, &'static str)> {
         let states = self.gate.states(|_| true);
-        states
-            .iter()
-            .map(|state| (state.node.to_string(), state.phase.as_str()))
-            .collect()
+        states.iter().map(|state| (state.node.to_string(), state.phase.as_str())).collect()
     }
 }
 
 fn named(phases: &[(&str, &'static str)]) -> Vec<(String, &'static str)> {
-    phases
-        .iter()
-        .map(|(node, phase)| ((*node).to_owned(), *phase))
-        .collect()
+    phases.iter().map(|(node, phase)| ((*node).to_owned(), *phase)).collect()
 }
 
 #[test]
@@ -91,23 +76,15 @@ fn any_trouble_of_a_place_that_it_changed_fails_it_and_none_of_others_does() {
     for trouble in [Trouble::Rejected, Trouble::Unhealthy, Trouble::Lost] {
         let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
         assert_eq!(w.phases(), named(&[("robot-1", "applied")]));
-        for other in [
-            "nav/0@robot-1",
-            "slam/own@robot-1",
-            "slam/2@robot-2",
-            "slam/9@robot-1",
-            "slam/0",
-        ] {
+        for other in
+            ["nav/0@robot-1", "slam/own@robot-1", "slam/2@robot-2", "slam/9@robot-1", "slam/0"]
+        {
             assert_eq!(w.hears(&complaint(other, trouble), 1), [], "{other}");
         }
         let failures = w.hears(&complaint("slam/0@robot-1", trouble), 60);
         assert_eq!(failures.len(), 1);
         assert_eq!(failures[0].uid, "Rollout/slam-slower");
-        assert!(
-            failures[0].reason.contains("slam/0 at robot-1"),
-            "{}",
-            failures[0].reason
-        );
+        assert!(failures[0].reason.contains("slam/0 at robot-1"), "{}", failures[0].reason);
         assert_eq!(w.phases(), named(&[("robot-1", "failed")]));
         assert_eq!(w.hears(&complaint("slam/1@robot-1", trouble), 60), [], "it fails once");
     }
@@ -179,25 +156,14 @@ fn on_the_broker_of_a_layer_each_node_is_judged_and_one_that_fails_undoes_it_for
     assert_eq!(w.hears(&complaint("slam/2@robot-2", Trouble::Lost), 1), []);
     assert_eq!(w.hears(&complaint("slam/1@robot-1", Trouble::Lost), 1).len(), 1);
     let states = w.gate.states(|_| true);
-    let of_slam: Vec<_> = states
-        .iter()
-        .filter(|state| state.name.as_str() == "slam-slower")
-        .collect();
-    assert_eq!(
-        (of_slam[0].phase, of_slam[0].node.as_str()),
-        (RolloutPhase::Failed, "robot-1")
-    );
+    let of_slam: Vec<_> =
+        states.iter().filter(|state| state.name.as_str() == "slam-slower").collect();
+    assert_eq!((of_slam[0].phase, of_slam[0].node.as_str()), (RolloutPhase::Failed, "robot-1"));
     assert_eq!(
         (of_slam[1].phase, of_slam[1].reason.as_str()),
         (RolloutPhase::Pending, "undone: it failed on robot-1")
     );
-    assert_eq!(
-        states
-            .iter()
-            .filter(|state| state.phase == RolloutPhase::Applied)
-            .count(),
-        2
-    );
+    assert_eq!(states.iter().filter(|state| state.phase == RolloutPhase::Applied).count(), 2);
     let of_two = w.gate.states(|node| node.as_str() == "robot-2");
     assert!(of_two.len() == 2 && of_two.iter().all(|state| state.node.as_str() == "robot-2"));
 }
@@ -206,8 +172,7 @@ fn on_the_broker_of_a_layer_each_node_is_judged_and_one_that_fails_undoes_it_for
 fn one_that_has_ended_is_forgotten() {
     let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
     assert!(!w.gate.follow(&w.served), "nothing is new");
-    w.served
-        .load(state(11, documents(vec![rollout("slam", 0, "promoted")])), Source::Copy);
+    w.served.load(state(11, documents(vec![rollout("slam", 0, "promoted")])), Source::Copy);
     w.served.flush(w.start);
     assert!(w.gate.follow(&w.served));
     assert_eq!(w.phases(), []);
@@ -220,10 +185,7 @@ fn a_change_of_one_node_is_tried_there_alone() {
         "canary": {"node_selector": "canary=true"}, "gate": {}});
     of_node.spec = std::sync::Arc::new(spec);
     assert_eq!(world(Some("robot-1"), vec![of_node.clone()]).phases(), []);
-    assert_eq!(
-        world(None, vec![of_node.clone()]).phases(),
-        named(&[("robot-2", "applied")])
-    );
+    assert_eq!(world(None, vec![of_node.clone()]).phases(), named(&[("robot-2", "applied")]));
     // Of a mounted file nobody knows which one it is.
     of_node.uid = String::new();
     assert_eq!(world(None, vec![of_node]).phases(), []);

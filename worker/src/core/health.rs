@@ -6,8 +6,8 @@
 //! blaze:watchdog:…  ─scan────────▶└───────┘──▶ Complaint: rejected, unhealthy, lost     ([`super::Gate`] judges them)
 //! ```
 //!
-//! A sign of life that does not come back is lost only if the worker could have heard it: an outage of the broker or of the
-//! Redis is no fault of a service.
+//! A sign of life that does not come back is lost only if the worker could have heard it: an outage
+//! of the broker or of the Redis is no fault of a service.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -20,7 +20,8 @@ use super::place::{Place, Site};
 
 /// Instances that are known, at most; more are counted and not known.
 pub const MAX_SIGNS: usize = 10_000;
-/// How long the word of an instance without a watchdog is shown. Those who ask again do so every 60 s.
+/// How long the word of an instance without a watchdog is shown. Those who ask again do so every 60
+/// s.
 const ACK_FOR: Duration = Duration::from_secs(180);
 /// How long a record of Redis is shown after the last look that found it, while nobody can look.
 const RECORD_FOR: Duration = Duration::from_secs(60);
@@ -97,12 +98,7 @@ impl Signs {
     /// Nobody has said anything.
     #[must_use]
     pub fn new(site: Site) -> Self {
-        Self {
-            site,
-            known: BTreeMap::new(),
-            is_changed: false,
-            left_out: 0,
-        }
+        Self { site, known: BTreeMap::new(), is_changed: false, left_out: 0 }
     }
 
     /// Takes what a service says about its configuration.
@@ -127,11 +123,7 @@ impl Signs {
             AckStatus::Unhealthy => Trouble::Unhealthy,
         };
         Some(Complaint {
-            place: Place {
-                service: ack.service,
-                instance: ack.instance,
-                node,
-            },
+            place: Place { service: ack.service, instance: ack.instance, node },
             trouble,
             hash: ack.hash,
             revision: ack.revision,
@@ -140,14 +132,22 @@ impl Signs {
     }
 
     /// The word of an instance without a watchdog; one that has a watchdog says more by that.
-    fn note_ack(&mut self, key: WatchdogKey, status: AckStatus, said: (Option<u64>, Option<&str>), now: Instant) {
+    fn note_ack(
+        &mut self,
+        key: WatchdogKey,
+        status: AckStatus,
+        said: (Option<u64>, Option<&str>),
+        now: Instant,
+    ) {
         let old = self.known.get(&key);
         if old.is_some_and(|known| known.origin != Origin::Ack) {
             return;
         }
         let (config_revision, config_hash) = match (status, old) {
             // It goes on with the configuration before.
-            (AckStatus::Rejected, Some(old)) => (old.row.config_revision, old.row.config_hash.clone()),
+            (AckStatus::Rejected, Some(old)) => {
+                (old.row.config_revision, old.row.config_hash.clone())
+            }
             (AckStatus::Rejected, None) => (0, String::new()),
             (AckStatus::Applied | AckStatus::Healthy | AckStatus::Unhealthy, _) => {
                 (said.0.unwrap_or(0), said.1.unwrap_or_default().to_owned())
@@ -161,13 +161,8 @@ impl Signs {
             config_revision,
             config_hash,
         };
-        let known = Known {
-            row,
-            origin: Origin::Ack,
-            epoch: 0,
-            ttl: ACK_FOR,
-            until: now + ACK_FOR,
-        };
+        let known =
+            Known { row, origin: Origin::Ack, epoch: 0, ttl: ACK_FOR, until: now + ACK_FOR };
         self.put(key, known);
     }
 
@@ -176,8 +171,14 @@ impl Signs {
         self.living(state, Origin::Message, now)
     }
 
-    /// Takes the records that were found in Redis; `is_whole`: those that are not among them are not there.
-    pub fn scanned(&mut self, states: Vec<ServiceState>, is_whole: bool, now: Instant) -> Vec<Complaint> {
+    /// Takes the records that were found in Redis; `is_whole`: those that are not among them are
+    /// not there.
+    pub fn scanned(
+        &mut self,
+        states: Vec<ServiceState>,
+        is_whole: bool,
+        now: Instant,
+    ) -> Vec<Complaint> {
         let mut out = Vec::new();
         let mut found = BTreeSet::new();
         for state in states {
@@ -185,7 +186,9 @@ impl Signs {
             out.extend(self.living(state, Origin::Redis, now));
         }
         if is_whole {
-            let is_gone = |key: &WatchdogKey, known: &Known| known.origin == Origin::Redis && !found.contains(key);
+            let is_gone = |key: &WatchdogKey, known: &Known| {
+                known.origin == Origin::Redis && !found.contains(key)
+            };
             out.extend(self.take_out(is_gone).into_iter().map(|(key, _)| lost(key)));
         }
         out
@@ -216,10 +219,9 @@ impl Signs {
             until: now + counts_for,
         };
         let complaint = match state.health {
-            Health::Unhealthy => Some(Complaint {
-                trouble: Trouble::Unhealthy,
-                ..lost(state.key.clone())
-            }),
+            Health::Unhealthy => {
+                Some(Complaint { trouble: Trouble::Unhealthy, ..lost(state.key.clone()) })
+            }
             Health::Starting | Health::Ready | Health::Stopping => None,
         };
         self.put(state.key, known);
@@ -258,7 +260,10 @@ impl Signs {
         lost.collect()
     }
 
-    fn take_out(&mut self, is_gone: impl Fn(&WatchdogKey, &Known) -> bool) -> Vec<(WatchdogKey, Known)> {
+    fn take_out(
+        &mut self,
+        is_gone: impl Fn(&WatchdogKey, &Known) -> bool,
+    ) -> Vec<(WatchdogKey, Known)> {
         let gone: Vec<_> = self.known.extract_if(.., |key, known| is_gone(key, known)).collect();
         self.is_changed |= !gone.is_empty();
         gone
@@ -300,11 +305,7 @@ impl Signs {
 
 fn lost(key: WatchdogKey) -> Complaint {
     Complaint {
-        place: Place {
-            service: key.service,
-            instance: Some(key.instance),
-            node: Some(key.node),
-        },
+        place: Place { service: key.service, instance: Some(key.instance), node: Some(key.node) },
         trouble: Trouble::Lost,
         hash: None,
         revision: None,

@@ -6,9 +6,11 @@ use std::time::Duration;
 
 use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, secret};
 
-/// Version of the protocol that is spoken here. Version 2: Hello says whether texts of secrets are wanted.
+/// Version of the protocol that is spoken here. Version 2: Hello says whether texts of secrets are
+/// wanted.
 pub const PROTOCOL: u32 = 2;
-/// Oldest version that is understood here: a worker serves with a main service that is one version older.
+/// Oldest version that is understood here: a worker serves with a main service that is one version
+/// older.
 pub const OLDEST_PROTOCOL: u32 = PROTOCOL - 1;
 /// Specs of a snapshot, in bytes of their compact JSON, at most (512 MiB).
 pub const MAX_SNAPSHOT_BYTES: usize = 512 * 1024 * 1024;
@@ -76,7 +78,9 @@ impl fmt::Debug for Incoming {
         match self {
             Self::Welcome { revision, .. } => write!(f, "Welcome({revision})"),
             Self::Snapshot { revision, .. } => write!(f, "Snapshot({revision})"),
-            Self::Commit { revision, previous, .. } => write!(f, "Commit({revision} after {previous})"),
+            Self::Commit { revision, previous, .. } => {
+                write!(f, "Commit({revision} after {previous})")
+            }
             Self::Bookmark { revision, .. } => write!(f, "Bookmark({revision})"),
             Self::GoAway { reason, .. } => write!(f, "GoAway({reason:?})"),
         }
@@ -116,11 +120,14 @@ pub(super) fn redact(document: &mut Document) {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SyncFault {
     /// A commit follows on another one than the last that was told: something is missing.
-    #[error("the commit follows on revision {got}, but {expected} was told last: something is missing")]
+    #[error(
+        "the commit follows on revision {got}, but {expected} was told last: something is missing"
+    )]
     Gap {
         /// What was told last in this stream.
         expected: u64,
-        /// What the commit says was told before it; for a commit that is not newer than the last, its own revision.
+        /// What the commit says was told before it; for a commit that is not newer than the last,
+        /// its own revision.
         got: u64,
     },
     /// Both have other documents at the same revision.
@@ -143,7 +150,8 @@ pub enum SyncFault {
     },
     /// The main service speaks another version.
     #[error(
-        "the main service speaks version {theirs} of the protocol, this worker {OLDEST_PROTOCOL} to {PROTOCOL}: \
+        "the main service speaks version {theirs} of the protocol, this worker {OLDEST_PROTOCOL} \
+         to {PROTOCOL}: \
          update the older of the two"
     )]
     Protocol {
@@ -152,7 +160,8 @@ pub enum SyncFault {
     },
     /// It goes on from a copy that is of another store, or newer than the store itself.
     #[error(
-        "the main service would go on from revision {ours} of store {store_id:?}, but it is at {theirs} of {other:?}"
+        "the main service would go on from revision {ours} of store {store_id:?}, but it is at \
+         {theirs} of {other:?}"
     )]
     OtherStore {
         /// The store of the copy.
@@ -181,14 +190,17 @@ pub enum SyncFault {
 }
 
 impl SyncFault {
-    /// Whether the copy cannot be gone on from: what is missing or different is only found again by a snapshot.
+    /// Whether the copy cannot be gone on from: what is missing or different is only found again by
+    /// a snapshot.
     #[must_use]
     pub fn needs_snapshot(&self) -> bool {
         match self {
             Self::Gap { .. } | Self::Digest { .. } | Self::OtherStore { .. } => true,
-            Self::Unexpected { .. } | Self::Protocol { .. } | Self::Mixed { .. } | Self::TooMany | Self::TooLarge => {
-                false
-            }
+            Self::Unexpected { .. }
+            | Self::Protocol { .. }
+            | Self::Mixed { .. }
+            | Self::TooMany
+            | Self::TooLarge => false,
         }
     }
 }

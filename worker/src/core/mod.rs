@@ -1,4 +1,5 @@
-//! What the worker knows and what follows from it. No I/O and no clock: everything comes in as an argument.
+//! What the worker knows and what follows from it. No I/O and no clock: everything comes in as an
+//! argument.
 //!
 //! ```text
 //! Incoming ──▶ Replica ──Change──▶ Served ──Flushed──▶ notices, keys of Redis            [messages] writes them
@@ -8,8 +9,9 @@
 //! acks, watchdogs ──▶ Signs ──Complaint──▶ Gate ──Failure──▶ Served undoes the roll-out
 //! ```
 //!
-//! [`Replica`] checks what the main service tells and has the documents; [`Served`] knows who is served with what, and
-//! works out from a change who must be told. [`Signs`] knows how the services are, and [`Gate`] judges roll-outs by it.
+//! [`Replica`] checks what the main service tells and has the documents; [`Served`] knows who is
+//! served with what, and works out from a change who must be told. [`Signs`] knows how the services
+//! are, and [`Gate`] judges roll-outs by it.
 
 mod answer;
 mod asked;

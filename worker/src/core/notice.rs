@@ -64,14 +64,15 @@ pub struct Notice {
     pub place: Place,
     /// The layer in which it counts.
     pub layer: LayerName,
-    /// Where the store stood when it changed; never goes down for a place, and may be the same for two notices (when a
-    /// roll-out is undone here, without a commit).
+    /// Where the store stood when it changed; never goes down for a place, and may be the same for
+    /// two notices (when a roll-out is undone here, without a commit).
     pub revision: u64,
     /// Over it; `None`: its service is deleted.
     pub hash: Option<String>,
     /// Over what was told before; `None`: nothing was.
     pub previous_hash: Option<String>,
-    /// JSON pointers of the leaves that differ, sorted. If what was told before is not known any more: all of them.
+    /// JSON pointers of the leaves that differ, sorted. If what was told before is not known any
+    /// more: all of them.
     pub paths: Vec<String>,
     /// Kinds of the documents that say something else than before, sorted.
     pub scopes: Vec<Scope>,
@@ -104,8 +105,8 @@ impl Notice {
     }
 }
 
-/// Kinds of the documents that say something else about a service than before. A roll-out counts as what it changes,
-/// because its change is in the documents that are compared.
+/// Kinds of the documents that say something else about a service than before. A roll-out counts as
+/// what it changes, because its change is in the documents that are compared.
 pub(super) fn scopes(old: &Sources, new: &Sources, service: &str) -> Vec<Scope> {
     let differs = |scope: Scope, one: &Option<Arc<Document>>, other: &Option<Arc<Document>>| {
         let (one, other) = (one.as_deref(), other.as_deref());
@@ -123,8 +124,13 @@ pub(super) fn scopes(old: &Sources, new: &Sources, service: &str) -> Vec<Scope> 
     .collect()
 }
 
-/// What a document says about a service: its configuration and its overrides. Empty ones are as absent.
-fn words<'d>(document: Option<&'d Document>, service: &str, scope: Scope) -> [Option<&'d Value>; 2] {
+/// What a document says about a service: its configuration and its overrides. Empty ones are as
+/// absent.
+fn words<'d>(
+    document: Option<&'d Document>,
+    service: &str,
+    scope: Scope,
+) -> [Option<&'d Value>; 2] {
     let Some(document) = document else { return [None, None] };
     let overrides = match scope {
         Scope::Layer | Scope::Node => document.overrides(service),
@@ -167,9 +173,7 @@ fn add_leaves(pointer: &str, value: &Value, out: &mut Vec<String>) -> bool {
 }
 
 fn members_leaves(pointer: &str, members: &Map<String, Value>, out: &mut Vec<String>) -> bool {
-    members
-        .iter()
-        .all(|(name, member)| add_leaves(&json::push(pointer, name), member, out))
+    members.iter().all(|(name, member)| add_leaves(&json::push(pointer, name), member, out))
 }
 
 #[cfg(test)]
@@ -180,14 +184,16 @@ mod tests {
 
     #[test]
     fn paths_are_those_of_leaves() {
-        let old = json!({"a": {"b": 1, "c": [1, 2]}, "gone": {"x": 1, "y": {}}, "same": {"deep": true}});
-        let new = json!({"a": {"b": 2, "c": [1, 3]}, "new": {"p": {"q": 1}, "r/s": null}, "same": {"deep": true}});
+        let old =
+            json!({"a": {"b": 1, "c": [1, 2]}, "gone": {"x": 1, "y": {}}, "same": {"deep": true}});
+        let new = json!({
+            "a": {"b": 2, "c": [1, 3]},
+            "new": {"p": {"q": 1}, "r/s": null},
+            "same": {"deep": true},
+        });
         let expected = ["/a/b", "/a/c", "/gone/x", "/gone/y", "/new/p/q", "/new/r~1s"];
         assert_eq!(paths(&old, &new), expected);
-        assert_eq!(
-            paths(&json!({}), &json!({"camera": {"rate_hz": 1}})),
-            ["/camera/rate_hz"]
-        );
+        assert_eq!(paths(&json!({}), &json!({"camera": {"rate_hz": 1}})), ["/camera/rate_hz"]);
         // A leaf that becomes an object, and the other way round.
         assert_eq!(paths(&json!({"a": 1}), &json!({"a": {"b": 2}})), ["/a", "/a/b"]);
         assert!(paths(&new, &new).is_empty());
@@ -203,7 +209,8 @@ mod tests {
 
     #[test]
     fn too_many_leaves_are_told_as_objects() {
-        let members: Map<String, Value> = (0..2000).map(|number| (number.to_string(), number.into())).collect();
+        let members: Map<String, Value> =
+            (0..2000).map(|number| (number.to_string(), number.into())).collect();
         let new = json!({"many": members});
         assert_eq!(paths(&json!({}), &new), ["/many"]);
     }

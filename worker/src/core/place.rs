@@ -18,9 +18,11 @@ pub struct Site {
     pub node: Option<NodeName>,
 }
 
-/// Who has a configuration of its own: an instance, or a service without one, at a node or at the layer alone.
+/// Who has a configuration of its own: an instance, or a service without one, at a node or at the
+/// layer alone.
 ///
-/// Ordered by service first, then instance (none before all others), so that the places of a service are a range.
+/// Ordered by service first, then instance (none before all others), so that the places of a
+/// service are a range.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Place {
     /// Which service.
@@ -45,11 +47,7 @@ impl Place {
 
     /// The first place of a service, in their order.
     pub(super) fn first_of(service: &ServiceName, instance: Option<&InstanceName>) -> Self {
-        Self {
-            service: service.clone(),
-            instance: instance.cloned(),
-            node: None,
-        }
+        Self { service: service.clone(), instance: instance.cloned(), node: None }
     }
 }
 
@@ -68,14 +66,14 @@ impl fmt::Display for Place {
 }
 
 impl Site {
-    /// The place that a document alone makes one of those that are told of changes: of a service the one without
-    /// instance, of an instance where it may run.
+    /// The place that a document alone makes one of those that are told of changes: of a service
+    /// the one without instance, of an instance where it may run.
     ///
-    /// On the broker of a node these are the instances placed on the node, and those placed on the layer or nowhere: they
-    /// may be started here at any time, and then look at the keys of Redis before anybody has asked for them. Those
-    /// placed on another node run there, and that node's worker tells them; if one asks here all the same, it is
-    /// told because it asked. On the broker of a layer these are all instances of the view, each at the node that its
-    /// document names.
+    /// On the broker of a node these are the instances placed on the node, and those placed on the
+    /// layer or nowhere: they may be started here at any time, and then look at the keys of Redis
+    /// before anybody has asked for them. Those placed on another node run there, and that node's
+    /// worker tells them; if one asks here all the same, it is told because it asked. On the broker
+    /// of a layer these are all instances of the view, each at the node that its document names.
     pub(super) fn home(&self, state: &State, document: &Document) -> Option<Place> {
         let (service, instance) = match document.key.kind() {
             Kind::Service => (ServiceName::from(document.key.name()), None),
@@ -92,11 +90,7 @@ impl Site {
             (Some(own), _) => Some(own.clone()),
             (None, _) => document.spec_node().and_then(|name| name.parse().ok()),
         };
-        Some(Place {
-            service,
-            instance,
-            node,
-        })
+        Some(Place { service, instance, node })
     }
 
     fn may_run(&self, own: &NodeName, instance: &Document) -> bool {

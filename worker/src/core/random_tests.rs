@@ -1,5 +1,5 @@
-//! Random documents and commits: however they come, everybody knows in the end what counts for it, and nobody is told what
-//! it knows.
+//! Random documents and commits: however they come, everybody knows in the end what counts for it,
+//! and nobody is told what it knows.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -37,7 +37,8 @@ struct Write {
 struct Content {
     config: Value,
     overrides: Value,
-    /// Decides what else there is to decide: where an instance runs, what a roll-out changes and how far it is, labels.
+    /// Decides what else there is to decide: where an instance runs, what a roll-out changes and
+    /// how far it is, labels.
     choice: usize,
 }
 
@@ -53,10 +54,12 @@ fn config() -> impl Strategy<Value = Value> {
     let leaf = prop_oneof![
         4 => (0_u64..3).prop_map(Value::from),
         1 => Just(Value::Null),
-        1 => (1_u64..3).prop_map(|version| json!({"$secret": {"text": "canary", "version": version}})),
+        1 => (1_u64..3).prop_map(|version| json!({"$secret": {"text": "canary",
+            "version": version}})),
         1 => (0_u64..2).prop_map(|inner| json!({"z": inner})),
     ];
-    proptest::collection::btree_map("[xy]", leaf, 0..3).prop_map(|members| Value::Object(members.into_iter().collect()))
+    proptest::collection::btree_map("[xy]", leaf, 0..3)
+        .prop_map(|members| Value::Object(members.into_iter().collect()))
 }
 
 fn write() -> impl Strategy<Value = Write> {
@@ -65,12 +68,10 @@ fn write() -> impl Strategy<Value = Write> {
         1 => config().prop_map(|config| json!({ "s": config })),
         1 => config().prop_map(|config| json!({ "t": config })),
     ];
-    let content = (config(), overrides, 0_usize..12).prop_map(|(config, overrides, choice)| Content {
-        config,
-        overrides,
-        choice,
-    });
-    (0..KEYS.len(), proptest::option::weighted(0.8, content)).prop_map(|(key, content)| Write { key, content })
+    let content = (config(), overrides, 0_usize..12)
+        .prop_map(|(config, overrides, choice)| Content { config, overrides, choice });
+    (0..KEYS.len(), proptest::option::weighted(0.8, content))
+        .prop_map(|(key, content)| Write { key, content })
 }
 
 fn steps() -> impl Strategy<Value = Vec<Step>> {
@@ -83,11 +84,7 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
 }
 
 fn written(key: &str, revision: u64, content: &Content) -> Document {
-    let Content {
-        config,
-        overrides,
-        choice,
-    } = content;
+    let Content { config, overrides, choice } = content;
     let spec = match key.split('/').next() {
         Some("Layer") => json!({"config": config, "overrides": overrides}),
         Some("Node") => json!({"layer": "edge", "config": config, "overrides": overrides}),
@@ -104,7 +101,11 @@ fn written(key: &str, revision: u64, content: &Content) -> Document {
                 2 => json!({"kind": "Node", "name": "a"}),
                 _ => json!({"kind": "Layer", "name": "edge"}),
             };
-            json!({"target": target, "patch": {"config": config}, "canary": {"node_selector": "canary=true"}})
+            json!({
+                "target": target,
+                "patch": {"config": config},
+                "canary": {"node_selector": "canary=true"},
+            })
         }
         _ => json!({ "config": config }),
     };
@@ -182,7 +183,9 @@ impl Run {
         for write in writes {
             let key: Key = KEYS[write.key].parse().unwrap();
             match &write.content {
-                Some(content) => self.truth.put(Arc::new(written(KEYS[write.key], revision, content))),
+                Some(content) => {
+                    self.truth.put(Arc::new(written(KEYS[write.key], revision, content)))
+                }
                 None => {
                     self.truth.remove(&key);
                 }
@@ -193,10 +196,7 @@ impl Run {
         if self.way == Way::AsSnapshots {
             return;
         }
-        self.served.apply(&Change {
-            keys: keys.into_iter().collect(),
-            new: self.truth.clone(),
-        });
+        self.served.apply(&Change { keys: keys.into_iter().collect(), new: self.truth.clone() });
         if self.way == Way::OneByOne {
             self.flush();
         }
@@ -224,18 +224,12 @@ impl Run {
     fn flush(&mut self) {
         if self.way == Way::AsSnapshots {
             let old = self.served.next.state.clone();
-            self.served.apply(&Change {
-                keys: difference(&old, &self.truth),
-                new: self.truth.clone(),
-            });
+            self.served
+                .apply(&Change { keys: difference(&old, &self.truth), new: self.truth.clone() });
         }
         let flushed = self.served.flush(self.now);
         for notice in &flushed.notices {
-            assert_ne!(
-                notice.hash, notice.previous_hash,
-                "{} was told nothing new",
-                notice.place
-            );
+            assert_ne!(notice.hash, notice.previous_hash, "{} was told nothing new", notice.place);
             self.told(&notice.place, notice.revision);
             assert!(notice.revision <= self.truth.revision());
             if let Some(known) = self.known.get(&notice.place) {
@@ -267,10 +261,7 @@ impl Run {
             assert_eq!(self.known.get(place), Some(&fresh), "{place}");
         }
         let site = self.served.site();
-        let homes = self
-            .truth
-            .all()
-            .filter_map(|(_, held)| site.home(&self.truth, &held.document));
+        let homes = self.truth.all().filter_map(|(_, held)| site.home(&self.truth, &held.document));
         let expected: BTreeSet<Place> = homes.chain(self.asked.iter().cloned()).collect();
         let told: BTreeSet<Place> = self.served.told().map(|(place, _)| place.clone()).collect();
         assert_eq!(told, expected);

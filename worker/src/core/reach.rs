@@ -1,4 +1,5 @@
-//! Who a change can concern. Only those are looked at, so that a change of one service costs nothing to the others.
+//! Who a change can concern. Only those are looked at, so that a change of one service costs
+//! nothing to the others.
 //!
 //! ```text
 //! Service   ─▶ places of the service, and those that its documents make new ones
@@ -67,11 +68,12 @@ impl Places {
         self.told.iter()
     }
 
-    pub(super) fn of_service<'p>(&'p self, service: &'p ServiceName) -> impl Iterator<Item = &'p Place> {
+    pub(super) fn of_service<'p>(
+        &'p self,
+        service: &'p ServiceName,
+    ) -> impl Iterator<Item = &'p Place> {
         let range = self.told.range(Place::first_of(service, None)..);
-        range
-            .map(|(place, _)| place)
-            .take_while(move |place| place.service == *service)
+        range.map(|(place, _)| place).take_while(move |place| place.service == *service)
     }
 
     pub(super) fn of_instance<'p>(
@@ -80,9 +82,9 @@ impl Places {
         instance: &'p InstanceName,
     ) -> impl Iterator<Item = &'p Place> {
         let range = self.told.range(Place::first_of(service, Some(instance))..);
-        range
-            .map(|(place, _)| place)
-            .take_while(move |place| place.service == *service && place.instance.as_ref() == Some(instance))
+        range.map(|(place, _)| place).take_while(move |place| {
+            place.service == *service && place.instance.as_ref() == Some(instance)
+        })
     }
 
     pub(super) fn on_node(&self, node: &NodeName) -> impl Iterator<Item = &Place> {
@@ -90,7 +92,8 @@ impl Places {
     }
 }
 
-/// Places that changed documents can concern: those that were told before, and those that are to be from now on.
+/// Places that changed documents can concern: those that were told before, and those that are to be
+/// from now on.
 pub(super) fn concerned(
     site: &Site,
     places: &Places,
@@ -98,13 +101,7 @@ pub(super) fn concerned(
     new: &State,
     keys: &BTreeSet<Key>,
 ) -> BTreeSet<Place> {
-    let mut search = Search {
-        site,
-        places,
-        old,
-        new,
-        found: BTreeSet::new(),
-    };
+    let mut search = Search { site, places, old, new, found: BTreeSet::new() };
     for key in keys {
         search.of_key(key);
     }
@@ -201,10 +198,8 @@ impl<'s> Search<'s> {
     /// Of the documents before and after, for it may have been aimed at something else.
     fn of_rollout(&mut self, key: &Key) {
         let both = [document(self.old, key), document(self.new, key)].into_iter().flatten();
-        let targets: BTreeSet<Key> = both
-            .filter(|rollout| is_active(rollout))
-            .filter_map(rollout_target)
-            .collect();
+        let targets: BTreeSet<Key> =
+            both.filter(|rollout| is_active(rollout)).filter_map(rollout_target).collect();
         for target in &targets {
             self.of_target(target);
         }
@@ -220,8 +215,7 @@ impl<'s> Search<'s> {
             }
             (Kind::Instance, Some(service)) => {
                 let instance = InstanceName::from(target.name());
-                self.found
-                    .extend(places.of_instance(service, &instance).filter(on_nodes).cloned());
+                self.found.extend(places.of_instance(service, &instance).filter(on_nodes).cloned());
             }
             (Kind::Node, _) => {
                 let node = NodeName::from(target.name());
@@ -242,9 +236,7 @@ fn affected(old: Option<&Document>, new: Option<&Document>) -> Affected {
         return Affected::All;
     }
     let names: BTreeSet<&String> = named(old).chain(named(new)).collect();
-    let differing = names
-        .into_iter()
-        .filter(|name| overrides(old, name) != overrides(new, name));
+    let differing = names.into_iter().filter(|name| overrides(old, name) != overrides(new, name));
     Affected::Some(differing.filter_map(|name| name.parse().ok()).collect())
 }
 

@@ -8,10 +8,7 @@ const TRACKED: [&str; 7] = ["blur", "blur/0@a", "slam", "slam/0@a", "slam/1@b", 
 fn places() -> Places {
     let mut places = Places::default();
     for text in TRACKED {
-        let told = Told {
-            revision: 1,
-            hash: Some("sha256:1".to_owned()),
-        };
+        let told = Told { revision: 1, hash: Some("sha256:1".to_owned()) };
         places.insert(place(text), told);
     }
     places
@@ -20,10 +17,7 @@ fn places() -> Places {
 fn found<const N: usize>(old: &State, new: &State, changed: [&str; N]) -> Vec<String> {
     let keys = keys(changed).into_iter().collect();
     let found = concerned(&site(None), &places(), old, new, &keys);
-    found
-        .iter()
-        .map(|place| place.to_string().replace(" at ", "@"))
-        .collect()
+    found.iter().map(|place| place.to_string().replace(" at ", "@")).collect()
 }
 
 #[test]
@@ -75,7 +69,9 @@ fn a_node_concerns_who_is_on_it() {
     let overrides = node(json!({"layer": "edge", "overrides": {"blur": {"a": 1}}}));
     assert_eq!(found(&plain, &config, ["Node/a"]), ["blur/0@a", "slam@a", "slam/0@a"]);
     assert_eq!(found(&plain, &overrides, ["Node/a"]), ["blur/0@a"]);
-    assert!(found(&plain, &node(json!({"layer": "edge", "type": "mobile"})), ["Node/a"]).is_empty());
+    assert!(
+        found(&plain, &node(json!({"layer": "edge", "type": "mobile"})), ["Node/a"]).is_empty()
+    );
     let chosen = state(1, [labelled("Node/a", 1, json!({"layer": "edge"}), ("canary", "true"))]);
     assert_eq!(found(&plain, &chosen, ["Node/a"]).len(), 3);
 }
@@ -89,28 +85,19 @@ fn a_roll_out_concerns_what_it_changes_on_nodes() {
     };
     let none = State::default();
     for (target, expected) in [
-        (
-            json!({"kind": "Service", "name": "slam"}),
-            vec!["slam@a", "slam/0@a", "slam/1@b"],
-        ),
+        (json!({"kind": "Service", "name": "slam"}), vec!["slam@a", "slam/0@a", "slam/1@b"]),
         (
             json!({"kind": "Layer", "name": "edge"}),
             vec!["blur/0@a", "slam@a", "slam/0@a", "slam/1@b"],
         ),
         (json!({"kind": "Node", "name": "b"}), vec!["slam/1@b"]),
-        (
-            json!({"kind": "Instance", "service": "slam", "name": "0"}),
-            vec!["slam/0@a"],
-        ),
+        (json!({"kind": "Instance", "service": "slam", "name": "0"}), vec!["slam/0@a"]),
         (json!({"kind": "Instance", "service": "slam", "name": "2"}), vec![]),
     ] {
         let tried = rollout(target.clone(), "canary");
         assert_eq!(found(&none, &tried, ["Rollout/try"]), expected);
         assert_eq!(found(&tried, &none, ["Rollout/try"]), expected);
-        assert_eq!(
-            found(&tried, &rollout(target.clone(), "failed"), ["Rollout/try"]),
-            expected
-        );
+        assert_eq!(found(&tried, &rollout(target.clone(), "failed"), ["Rollout/try"]), expected);
         let over = rollout(target, "promoted");
         assert!(found(&over, &over, ["Rollout/try"]).is_empty());
     }

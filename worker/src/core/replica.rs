@@ -6,7 +6,8 @@
 //!                                                                                      └─ a fault: Hello with 0
 //! ```
 //!
-//! Whatever goes wrong, the documents stay as they were: those that have been served go on being served.
+//! Whatever goes wrong, the documents stay as they were: those that have been served go on being
+//! served.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -65,7 +66,8 @@ enum Stream {
     Live {
         /// The commit that was told last, or where the stream began.
         told: u64,
-        /// Until the first commit that is new, older ones may come again; the revision from which the stream was resumed.
+        /// Until the first commit that is new, older ones may come again; the revision from which
+        /// the stream was resumed.
         resumed: Option<u64>,
     },
     /// Nothing sensible comes any more.
@@ -93,12 +95,7 @@ impl Replica {
     /// From a copy of a store.
     #[must_use]
     pub fn from_copy(store_id: String, state: State, as_of: Timestamp) -> Self {
-        Self {
-            store_id: Some(store_id),
-            state,
-            as_of: Some(as_of),
-            ..Self::default()
-        }
+        Self { store_id: Some(store_id), state, as_of: Some(as_of), ..Self::default() }
     }
 
     /// The store that it is a copy of.
@@ -139,11 +136,9 @@ impl Replica {
                 revision: self.state.revision(),
                 digest: self.digest(),
             },
-            Some(_) | None => ResumePoint {
-                store_id: String::new(),
-                revision: 0,
-                digest: String::new(),
-            },
+            Some(_) | None => {
+                ResumePoint { store_id: String::new(), revision: 0, digest: String::new() }
+            }
         }
     }
 
@@ -172,7 +167,8 @@ impl Replica {
     }
 
     fn note_sync(&mut self, now: Timestamp) {
-        self.in_sync = matches!(self.stream, Stream::Live { .. }) && self.state.revision() >= self.goal;
+        self.in_sync =
+            matches!(self.stream, Stream::Live { .. }) && self.state.revision() >= self.goal;
         if self.in_sync {
             // A clock that was set back does not make the copy older than it is.
             self.as_of = Some(self.as_of.map_or(now, |before| before.max(now)));
@@ -182,25 +178,18 @@ impl Replica {
     fn take(&mut self, incoming: Incoming) -> Result<Applied, SyncFault> {
         match incoming {
             Incoming::GoAway { retry_after, reason } => Ok(Applied::GoAway { retry_after, reason }),
-            Incoming::Welcome {
-                protocol,
-                store_id,
-                revision,
-                resumed,
-            } => self
-                .welcome(protocol, store_id, revision, resumed)
-                .map(|()| Applied::Nothing),
-            Incoming::Snapshot {
-                revision,
-                documents,
-                last,
-            } => self.snapshot(revision, documents, last),
-            Incoming::Commit {
-                revision,
-                previous,
-                edits,
-            } => self.commit(revision, previous, edits),
-            Incoming::Bookmark { revision, digest } => self.bookmark(revision, digest).map(|()| Applied::Nothing),
+            Incoming::Welcome { protocol, store_id, revision, resumed } => {
+                self.welcome(protocol, store_id, revision, resumed).map(|()| Applied::Nothing)
+            }
+            Incoming::Snapshot { revision, documents, last } => {
+                self.snapshot(revision, documents, last)
+            }
+            Incoming::Commit { revision, previous, edits } => {
+                self.commit(revision, previous, edits)
+            }
+            Incoming::Bookmark { revision, digest } => {
+                self.bookmark(revision, digest).map(|()| Applied::Nothing)
+            }
         }
     }
 
@@ -214,7 +203,13 @@ impl Replica {
         SyncFault::Unexpected { message, waited_for }
     }
 
-    fn welcome(&mut self, protocol: u32, store_id: String, revision: u64, resumed: bool) -> Result<(), SyncFault> {
+    fn welcome(
+        &mut self,
+        protocol: u32,
+        store_id: String,
+        revision: u64,
+        resumed: bool,
+    ) -> Result<(), SyncFault> {
         if !matches!(self.stream, Stream::Closed) {
             return Err(self.unexpected("Welcome"));
         }
@@ -224,12 +219,8 @@ impl Replica {
         self.goal = revision;
         let ours = self.state.revision();
         if !resumed {
-            self.stream = Stream::Snapshot {
-                store_id,
-                revision: None,
-                documents: Vec::new(),
-                bytes: 0,
-            };
+            self.stream =
+                Stream::Snapshot { store_id, revision: None, documents: Vec::new(), bytes: 0 };
             return Ok(());
         }
         if self.is_stale || self.store_id.as_ref() != Some(&store_id) || revision < ours {
@@ -240,30 +231,24 @@ impl Replica {
                 theirs: revision,
             });
         }
-        self.stream = Stream::Live {
-            told: ours,
-            resumed: Some(ours),
-        };
+        self.stream = Stream::Live { told: ours, resumed: Some(ours) };
         Ok(())
     }
 
     /// Collects the parts; only the last one changes anything.
-    fn snapshot(&mut self, revision: u64, part: Vec<Document>, last: bool) -> Result<Applied, SyncFault> {
-        let Stream::Snapshot {
-            store_id,
-            revision: first,
-            documents,
-            bytes,
-        } = &mut self.stream
+    fn snapshot(
+        &mut self,
+        revision: u64,
+        part: Vec<Document>,
+        last: bool,
+    ) -> Result<Applied, SyncFault> {
+        let Stream::Snapshot { store_id, revision: first, documents, bytes } = &mut self.stream
         else {
             return Err(self.unexpected("Snapshot"));
         };
         let expected = *first.get_or_insert(revision);
         if expected != revision {
-            return Err(SyncFault::Mixed {
-                expected,
-                got: revision,
-            });
+            return Err(SyncFault::Mixed { expected, got: revision });
         }
         if documents.len() + part.len() > MAX_DOCUMENTS {
             return Err(SyncFault::TooMany);
@@ -278,17 +263,19 @@ impl Replica {
         }
         let new = State::new(revision, std::mem::take(documents));
         self.store_id = Some(std::mem::take(store_id));
-        self.stream = Stream::Live {
-            told: revision,
-            resumed: None,
-        };
+        self.stream = Stream::Live { told: revision, resumed: None };
         self.goal = revision;
         self.is_stale = false;
         let keys = difference(&self.state, &new);
         Ok(self.changed(keys, new))
     }
 
-    fn commit(&mut self, revision: u64, previous: u64, edits: Vec<Edit>) -> Result<Applied, SyncFault> {
+    fn commit(
+        &mut self,
+        revision: u64,
+        previous: u64,
+        edits: Vec<Edit>,
+    ) -> Result<Applied, SyncFault> {
         let Stream::Live { told, resumed } = &mut self.stream else {
             return Err(self.unexpected("Commit"));
         };
@@ -298,23 +285,18 @@ impl Replica {
                 *told = revision;
                 return Ok(Applied::Nothing);
             }
-            // Nothing is missing either way: everything up to the start was applied, whatever came again.
+            // Nothing is missing either way: everything up to the start was applied, whatever came
+            // again.
             if previous == start {
                 *told = start;
             }
         }
         if previous != *told {
-            return Err(SyncFault::Gap {
-                expected: *told,
-                got: previous,
-            });
+            return Err(SyncFault::Gap { expected: *told, got: previous });
         }
         // Also behind a bookmark everything is new: up to it all was told.
         if revision <= (*told).max(self.state.revision()) {
-            return Err(SyncFault::Gap {
-                expected: *told,
-                got: revision,
-            });
+            return Err(SyncFault::Gap { expected: *told, got: revision });
         }
         let mut new = self.state.clone();
         let mut keys: Vec<Key> = Vec::with_capacity(edits.len());

@@ -8,12 +8,7 @@ fn at(second: i64) -> Timestamp {
 }
 
 fn welcome(revision: u64, resumed: bool) -> Incoming {
-    Incoming::Welcome {
-        protocol: PROTOCOL,
-        store_id: "store".to_owned(),
-        revision,
-        resumed,
-    }
+    Incoming::Welcome { protocol: PROTOCOL, store_id: "store".to_owned(), revision, resumed }
 }
 
 fn node(name: &str, revision: u64) -> Document {
@@ -21,34 +16,19 @@ fn node(name: &str, revision: u64) -> Document {
 }
 
 fn part(revision: u64, documents: Vec<Document>, last: bool) -> Incoming {
-    Incoming::Snapshot {
-        revision,
-        documents,
-        last,
-    }
+    Incoming::Snapshot { revision, documents, last }
 }
 
 fn put(revision: u64, previous: u64, document: Document) -> Incoming {
-    Incoming::Commit {
-        revision,
-        previous,
-        edits: vec![Edit::Put(document)],
-    }
+    Incoming::Commit { revision, previous, edits: vec![Edit::Put(document)] }
 }
 
 fn remove(revision: u64, previous: u64, document: Document) -> Incoming {
-    Incoming::Commit {
-        revision,
-        previous,
-        edits: vec![Edit::Remove(document.key)],
-    }
+    Incoming::Commit { revision, previous, edits: vec![Edit::Remove(document.key)] }
 }
 
 fn bookmark(revision: u64, digest: &str) -> Incoming {
-    Incoming::Bookmark {
-        revision,
-        digest: digest.to_owned(),
-    }
+    Incoming::Bookmark { revision, digest: digest.to_owned() }
 }
 
 /// Two nodes at revision 10, from a snapshot.
@@ -95,10 +75,7 @@ fn a_snapshot_is_applied_whole_with_its_last_part() {
     assert_eq!(replica.as_of(), Some(at(5)));
     let digest = replica.digest();
     let point = replica.resume_point();
-    assert_eq!(
-        (point.store_id.as_str(), point.revision, point.digest),
-        ("store", 12, digest)
-    );
+    assert_eq!((point.store_id.as_str(), point.revision, point.digest), ("store", 12, digest));
 }
 
 #[test]
@@ -164,11 +141,7 @@ fn a_lost_commit_is_noticed_and_leads_to_a_snapshot() {
     assert!(matches!(after, Err(SyncFault::Unexpected { .. })));
     assert_eq!(
         replica.resume_point(),
-        ResumePoint {
-            store_id: String::new(),
-            revision: 0,
-            digest: String::new()
-        }
+        ResumePoint { store_id: String::new(), revision: 0, digest: String::new() }
     );
     replica.disconnected();
     replica.apply(welcome(14, false), at(2)).unwrap();
@@ -205,14 +178,7 @@ fn other_documents_at_the_same_revision_are_noticed() {
     let ours = replica.digest();
     let fault = replica.apply(bookmark(12, "sha256:other"), at(2)).unwrap_err();
     let theirs = "sha256:other".to_owned();
-    assert_eq!(
-        fault,
-        SyncFault::Digest {
-            revision: 12,
-            ours,
-            theirs
-        }
-    );
+    assert_eq!(fault, SyncFault::Digest { revision: 12, ours, theirs });
     assert_eq!((replica.resume_point().revision, replica.as_of()), (0, Some(at(1))));
 }
 
@@ -229,12 +195,9 @@ fn the_digest_follows_the_documents() {
 
 #[test]
 fn after_a_resume_what_was_applied_already_may_come_again() {
-    for (repeats, previous) in [
-        (vec![(9, 5), (12, 9)], 12),
-        (vec![(14, 9)], 14),
-        (vec![(9, 5)], 14),
-        (vec![], 14),
-    ] {
+    for (repeats, previous) in
+        [(vec![(9, 5), (12, 9)], 12), (vec![(14, 9)], 14), (vec![(9, 5)], 14), (vec![], 14)]
+    {
         let mut replica = resumed(14);
         for (revision, previous) in repeats {
             let again = replica.apply(remove(revision, previous, node("a", 3)), at(2));
@@ -290,13 +253,7 @@ fn who_is_behind_the_store_is_not_in_sync_yet() {
 fn messages_out_of_order_are_faults() {
     let mut replica = Replica::default();
     let fault = replica.apply(bookmark(3, ""), at(0)).unwrap_err();
-    assert_eq!(
-        fault,
-        SyncFault::Unexpected {
-            message: "Bookmark",
-            waited_for: "a Welcome"
-        }
-    );
+    assert_eq!(fault, SyncFault::Unexpected { message: "Bookmark", waited_for: "a Welcome" });
     // Nothing is known to be wrong with the copy.
     let mut replica = self::replica();
     replica.apply(welcome(10, true), at(0)).unwrap_err();
@@ -329,7 +286,8 @@ fn a_main_service_one_version_older_is_understood_and_no_other() {
 
 #[test]
 fn no_secret_is_shown() {
-    let spec = json!({"layer": "edge", "config": {"pw": {"$secret": {"text": "canary", "version": 3}}}});
+    let spec =
+        json!({"layer": "edge", "config": {"pw": {"$secret": {"text": "canary", "version": 3}}}});
     let document = document("Node/a", 3, spec);
     for incoming in [part(10, vec![document.clone()], true), put(11, 10, document.clone())] {
         assert!(!format!("{incoming:?}").contains("canary"));

@@ -10,8 +10,9 @@
 //!                              shown documents ──▶ answers
 //! ```
 //!
-//! Answers come from the documents of the last [`Served::flush`], as notices do: so what a place was told last is always
-//! what its configuration is in the shown documents, and no configuration has to be kept beside them.
+//! Answers come from the documents of the last [`Served::flush`], as notices do: so what a place
+//! was told last is always what its configuration is in the shown documents, and no configuration
+//! has to be kept beside them.
 
 #[path = "served_trial.rs"]
 mod trial;
@@ -89,8 +90,8 @@ impl Served {
         &self.site
     }
 
-    /// Where the documents come from: those that the main service told are a copy as soon as it is not certain any more
-    /// that they are its newest.
+    /// Where the documents come from: those that the main service told are a copy as soon as it is
+    /// not certain any more that they are its newest.
     #[must_use]
     pub fn source(&self) -> Option<Source> {
         match self.rank? {
@@ -129,7 +130,8 @@ impl Served {
         &self.next.failed
     }
 
-    /// Takes documents from a copy or a file, unless what is served comes from a stronger source. Gives whether it did.
+    /// Takes documents from a copy or a file, unless what is served comes from a stronger source.
+    /// Gives whether it did.
     pub fn load(&mut self, state: State, source: Source) -> bool {
         let is_taken = self.rank.is_none_or(|held| held <= source);
         if is_taken {
@@ -157,8 +159,8 @@ impl Served {
         self.rank = Some(source);
     }
 
-    /// Says whether the documents are known to be the main service's newest. If so, they count as coming from there, also
-    /// if it had nothing to add to the copy.
+    /// Says whether the documents are known to be the main service's newest. If so, they count as
+    /// coming from there, also if it had nothing to add to the copy.
     pub fn set_in_sync(&mut self, in_sync: bool) {
         self.in_sync = in_sync;
         if in_sync && self.rank.is_some() {
@@ -166,8 +168,9 @@ impl Served {
         }
     }
 
-    /// Whether a place has a key of its own in Redis: there, a place is service and instance alone. On the broker of a layer
-    /// one instance may ask from several nodes, so only the place of its document has it.
+    /// Whether a place has a key of its own in Redis: there, a place is service and instance alone.
+    /// On the broker of a layer one instance may ask from several nodes, so only the place of its
+    /// document has it.
     #[must_use]
     pub fn has_key(&self, place: &Place) -> bool {
         self.site.node.is_some() || self.site.is_home(&self.shown.state, place)
@@ -177,15 +180,16 @@ impl Served {
     #[must_use]
     pub fn has_pending(&self) -> bool {
         let has_documents = !self.pending.is_empty() || self.next.is_loaded != self.shown.is_loaded;
-        has_documents || !self.untracked.is_empty() || (self.next.is_loaded && !self.restored.is_empty())
+        has_documents
+            || !self.untracked.is_empty()
+            || (self.next.is_loaded && !self.restored.is_empty())
     }
 
-    /// Shows the newest documents, and tells whose configuration is another one than the last that they were told.
+    /// Shows the newest documents, and tells whose configuration is another one than the last that
+    /// they were told.
     pub fn flush(&mut self, now: Instant) -> Flushed {
-        let mut out = Flushed {
-            untracked: std::mem::take(&mut self.untracked),
-            ..Flushed::default()
-        };
+        let mut out =
+            Flushed { untracked: std::mem::take(&mut self.untracked), ..Flushed::default() };
         for place in self.asked.expire(now) {
             if self.drop_unless_home(&place) {
                 out.untracked.push(place);
@@ -214,7 +218,8 @@ impl Served {
         let new = self.next.at(&self.site, &place);
         let old_hash = old.as_ref().map(Sources::hash);
         let hash = new.as_ref().map(Sources::hash);
-        // Who was not told anything yet could have asked: the configuration was there without its document.
+        // Who was not told anything yet could have asked: the configuration was there without its
+        // document.
         let before = told.map_or_else(|| old_hash.clone(), |told| told.hash.clone());
         let is_tracked = told.is_some();
         let revision = match told {
@@ -223,8 +228,7 @@ impl Served {
         };
         if before != hash || is_open {
             let known = old.filter(|_| old_hash == before);
-            out.notices
-                .push(self.notice(&place, revision, before, known, new.zip(hash.clone())));
+            out.notices.push(self.notice(&place, revision, before, known, new.zip(hash.clone())));
         }
         let is_asked = self.asked.contains(&place);
         if is_asked || self.site.is_home(&self.next.state, &place) {
@@ -237,8 +241,8 @@ impl Served {
         }
     }
 
-    /// A notice for each place, for a worker that begins to notify. They have the newest revision: other workers may have
-    /// notified the same state with a later one than is known here.
+    /// A notice for each place, for a worker that begins to notify. They have the newest revision:
+    /// other workers may have notified the same state with a later one than is known here.
     pub fn announce(&mut self) -> Vec<Notice> {
         let places: Vec<(Place, String)> = self
             .places
@@ -258,8 +262,9 @@ impl Served {
         notices
     }
 
-    /// Takes over what another life, or another worker, knew: places that it notified, and the revision up to which it did. The
-    /// places count as if they had asked now, because they may well be running.
+    /// Takes over what another life, or another worker, knew: places that it notified, and the
+    /// revision up to which it did. The places count as if they had asked now, because they may
+    /// well be running.
     pub fn restore(&mut self, floor: u64, places: impl IntoIterator<Item = Place>, now: Instant) {
         self.floor = self.floor.max(floor);
         for place in places {
@@ -270,7 +275,8 @@ impl Served {
         }
     }
 
-    /// Takes a later state of the store that is served: it replaces even what the main service told.
+    /// Takes a later state of the store that is served: it replaces even what the main service
+    /// told.
     pub fn take_later(&mut self, state: State) {
         self.pending.extend(difference(&self.next.state, &state));
         let rank = self.rank.map_or(Source::Copy, |rank| rank.max(Source::Copy));
@@ -349,10 +355,7 @@ impl Served {
         let sources = self.shown.at(&self.site, place)?;
         self.note_asked(place, now);
         if self.places.get(place).is_none() {
-            let told = Told {
-                revision: self.floor,
-                hash: Some(sources.hash()),
-            };
+            let told = Told { revision: self.floor, hash: Some(sources.hash()) };
             self.places.insert(place.clone(), told);
         }
         self.standing_of(place)
@@ -367,7 +370,8 @@ impl Served {
         Some(self.standing(place.at(&self.site), told.revision, hash, sources))
     }
 
-    /// The configuration of a place, without counting it as one that asked; `None`: nothing is there, or no such service.
+    /// The configuration of a place, without counting it as one that asked; `None`: nothing is
+    /// there, or no such service.
     #[must_use]
     pub fn look_up(&self, place: &Place) -> Option<Standing> {
         let sources = self.shown.at(&self.site, place).filter(|_| self.is_ready())?;

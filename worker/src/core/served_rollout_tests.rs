@@ -23,18 +23,15 @@ fn a_roll_out_is_told_on_its_canaries_alone() {
         (&["/rate_hz".to_owned()][..], &[Scope::Service][..])
     );
     let canary = place("slam/0@robot-1");
-    assert!(served.is_changed_by("Rollout/slower", &canary) && !served.is_changed_by("other", &canary));
+    assert!(
+        served.is_changed_by("Rollout/slower", &canary) && !served.is_changed_by("other", &canary)
+    );
     assert!(!served.is_changed_by("Rollout/slower", &place("slam/1@robot-2")));
     // A second canary, by its label.
     put(
         &mut served,
         12,
-        vec![labelled(
-            "Node/robot-2",
-            12,
-            json!({"layer": "edge"}),
-            ("canary", "true"),
-        )],
+        vec![labelled("Node/robot-2", 12, json!({"layer": "edge"}), ("canary", "true"))],
     );
     assert_eq!(places(&flush(&mut served)), ["slam/1 at robot-2"]);
     // The main service says that it failed.
@@ -85,8 +82,5 @@ fn of_too_many_failed_roll_outs_those_that_are_over_go() {
         served.fail_rollout(&number.to_string());
     }
     assert_eq!(served.failed().len(), MAX_FAILED);
-    assert_eq!(
-        (served.failed()[0].as_str(), served.failed()[1].as_str()),
-        ("Rollout/slower", "1")
-    );
+    assert_eq!((served.failed()[0].as_str(), served.failed()[1].as_str()), ("Rollout/slower", "1"));
 }

@@ -53,10 +53,7 @@ fn remove<const N: usize>(served: &mut Served, revision: u64, texts: [&str; N]) 
 }
 
 fn begin(served: &Served) -> Change {
-    Change {
-        keys: Vec::new(),
-        new: served.next.state.clone(),
-    }
+    Change { keys: Vec::new(), new: served.next.state.clone() }
 }
 
 fn flush(served: &mut Served) -> Vec<Notice> {
@@ -88,10 +85,7 @@ fn the_first_documents_are_told_to_everybody_who_has_one() {
             .all(|notice| notice.previous_hash.is_none() && notice.revision == 10)
     );
     assert_eq!(flushed.notices[1].paths, ["/fov", "/log", "/rate_hz"]);
-    assert_eq!(
-        flushed.notices[1].scopes,
-        [Scope::Layer, Scope::Service, Scope::Instance]
-    );
+    assert_eq!(flushed.notices[1].scopes, [Scope::Layer, Scope::Service, Scope::Instance]);
     assert_eq!(flushed.notices[0].source, Source::File);
     assert!(served.is_ready() && !served.has_pending());
 }
@@ -100,12 +94,8 @@ fn the_first_documents_are_told_to_everybody_who_has_one() {
 fn on_a_node_those_are_told_that_may_run_there() {
     let served = served(Some("robot-1"));
     let told: Vec<String> = served.told().map(|(place, _)| place.to_string()).collect();
-    let expected = [
-        "slam at robot-1",
-        "slam/0 at robot-1",
-        "slam/2 at robot-1",
-        "slam/3 at robot-1",
-    ];
+    let expected =
+        ["slam at robot-1", "slam/0 at robot-1", "slam/2 at robot-1", "slam/3 at robot-1"];
     assert_eq!(told, expected);
 }
 
@@ -115,11 +105,7 @@ fn a_change_is_told_to_those_whose_hash_it_changes() {
     put(
         &mut served,
         11,
-        vec![document(
-            "Instance/slam/0",
-            11,
-            json!({"node": "robot-1", "config": {"fov": 2}}),
-        )],
+        vec![document("Instance/slam/0", 11, json!({"node": "robot-1", "config": {"fov": 2}}))],
     );
     let notices = flush(&mut served);
     assert_eq!(places(&notices), ["slam/0 at robot-1"]);
@@ -139,11 +125,7 @@ fn a_change_is_told_to_those_whose_hash_it_changes() {
 fn several_commits_become_one_notice_with_the_last_state() {
     let mut served = served(Some("robot-1"));
     put(&mut served, 11, vec![slam(31, 11)]);
-    put(
-        &mut served,
-        12,
-        vec![document("Layer/edge", 12, json!({"config": {"log": "debug"}}))],
-    );
+    put(&mut served, 12, vec![document("Layer/edge", 12, json!({"config": {"log": "debug"}}))]);
     put(&mut served, 13, vec![slam(32, 13)]);
     let notices = flush(&mut served);
     assert_eq!(notices.len(), 4);
@@ -161,12 +143,7 @@ fn a_deleted_service_is_told_once_to_all_its_places() {
     let now = Instant::now();
     let mut served = served(Some("robot-1"));
     served.ask(&place("slam/9@robot-1"), now).unwrap();
-    let instances = [
-        "Instance/slam/0",
-        "Instance/slam/1",
-        "Instance/slam/2",
-        "Instance/slam/3",
-    ];
+    let instances = ["Instance/slam/0", "Instance/slam/1", "Instance/slam/2", "Instance/slam/3"];
     remove(&mut served, 11, instances);
     remove(&mut served, 12, ["Service/slam"]);
     let flushed = served.flush(now);
@@ -182,11 +159,7 @@ fn a_deleted_service_is_told_once_to_all_its_places() {
     put(&mut served, 13, vec![slam(30, 13)]);
     let notices = served.flush(now).notices;
     assert_eq!(places(&notices), ["slam at robot-1", "slam/9 at robot-1"]);
-    assert!(
-        notices
-            .iter()
-            .all(|notice| notice.previous_hash.is_none() && notice.revision == 13)
-    );
+    assert!(notices.iter().all(|notice| notice.previous_hash.is_none() && notice.revision == 13));
 }
 
 fn remembered(served: &Served) -> Vec<Place> {
@@ -210,11 +183,7 @@ fn after_a_restart_nothing_older_is_told_and_places_that_asked_are_known() {
     put(&mut served, 21, vec![slam(31, 20)]);
     let notices = flush(&mut served);
     assert_eq!(notices.len(), 5);
-    assert!(
-        notices
-            .iter()
-            .all(|notice| notice.revision == 21 && notice.paths == ["/rate_hz"])
-    );
+    assert!(notices.iter().all(|notice| notice.revision == 21 && notice.paths == ["/rate_hz"]));
 }
 
 #[test]
@@ -226,11 +195,7 @@ fn a_service_that_went_while_the_worker_was_down_is_told() {
     served.load(state(12, [document("Layer/edge", 1, json!({}))]), Source::Copy);
     let notices = flush(&mut served);
     assert_eq!(notices.len(), 5);
-    assert!(
-        notices
-            .iter()
-            .all(|notice| notice.hash.is_none() && notice.revision == 12)
-    );
+    assert!(notices.iter().all(|notice| notice.hash.is_none() && notice.revision == 12));
 }
 
 #[test]
@@ -238,22 +203,11 @@ fn an_announcement_is_of_all_places_and_of_the_newest_revision() {
     let mut served = served(Some("robot-1"));
     put(&mut served, 20, vec![slam(31, 20)]);
     flush(&mut served);
-    put(
-        &mut served,
-        21,
-        vec![document("Service/nav", 21, json!({ "description": "x" }))],
-    );
+    put(&mut served, 21, vec![document("Service/nav", 21, json!({ "description": "x" }))]);
     flush(&mut served);
     let notices = served.announce();
-    assert_eq!(
-        notices.len(),
-        served.told().filter(|(_, told)| told.hash.is_some()).count()
-    );
-    assert!(
-        notices
-            .iter()
-            .all(|notice| notice.revision == 21 && notice.previous_hash.is_none())
-    );
+    assert_eq!(notices.len(), served.told().filter(|(_, told)| told.hash.is_some()).count());
+    assert!(notices.iter().all(|notice| notice.revision == 21 && notice.previous_hash.is_none()));
     assert_eq!(served.standing_of(&notices[0].place).unwrap().revision, 21);
 }
 

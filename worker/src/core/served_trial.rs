@@ -1,4 +1,5 @@
-//! Roll-outs that are tried here: on which nodes, whose configuration they change, and how one is undone.
+//! Roll-outs that are tried here: on which nodes, whose configuration they change, and how one is
+//! undone.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -34,7 +35,8 @@ pub struct Trial {
 }
 
 impl Served {
-    /// Undoes a roll-out here, before the main service knows. Of too many those go first that are over.
+    /// Undoes a roll-out here, before the main service knows. Of too many those go first that are
+    /// over.
     pub fn fail_rollout(&mut self, uid: &str) {
         if self.next.failed.iter().any(|failed| failed == uid) {
             return;
@@ -47,7 +49,8 @@ impl Served {
         self.pending.extend(found(uid).map(|(key, _)| key.clone()));
         let failed = Arc::make_mut(&mut self.next.failed);
         if failed.len() >= MAX_FAILED {
-            let is_over = |uid: &String| found(uid).is_none_or(|(_, held)| !is_active(&held.document));
+            let is_over =
+                |uid: &String| found(uid).is_none_or(|(_, held)| !is_active(&held.document));
             let over = failed.iter().position(is_over);
             let forgotten = failed.remove(over.unwrap_or(0));
             if over.is_none() {
@@ -60,8 +63,8 @@ impl Served {
         failed.push(uid.to_owned());
     }
 
-    /// Whether a roll-out that is on its canaries has an effect on the configuration of a place, in the shown documents: the
-    /// health of such places tells whether it goes well.
+    /// Whether a roll-out that is on its canaries has an effect on the configuration of a place, in
+    /// the shown documents: the health of such places tells whether it goes well.
     #[must_use]
     pub fn is_changed_by(&self, uid: &str, place: &Place) -> bool {
         if place.node.is_none() || self.places.get(place).is_none() {
@@ -87,8 +90,9 @@ impl Served {
         self.places.on_node(node).any(|place| self.asked.contains(place))
     }
 
-    /// The roll-outs that are on their canaries in the shown documents, in the order of their names. Those without a uid
-    /// (of a mounted file) are left out: nobody could be told which one failed.
+    /// The roll-outs that are on their canaries in the shown documents, in the order of their
+    /// names. Those without a uid (of a mounted file) are left out: nobody could be told which one
+    /// failed.
     #[must_use]
     pub fn trials(&self) -> Vec<Trial> {
         let rollouts = self.shown.state.of_kind(Kind::Rollout, None);
@@ -119,7 +123,8 @@ impl Served {
         let own = placement(state, &target.document).node;
         let is_canary = |key: &Key, node: &Document| {
             let name = NodeName::from(key.name());
-            (selector.matches(&node.labels) && own.as_ref().is_none_or(|own| *own == name)).then_some(name)
+            (selector.matches(&node.labels) && own.as_ref().is_none_or(|own| *own == name))
+                .then_some(name)
         };
         match &self.site.node {
             Some(node) => {

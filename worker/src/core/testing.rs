@@ -51,17 +51,10 @@ pub(crate) fn place(text: &str) -> Place {
         Some((service, instance)) => (service, Some(instance.parse().unwrap())),
         None => (name, None),
     };
-    Place {
-        service: service.parse().unwrap(),
-        instance,
-        node,
-    }
+    Place { service: service.parse().unwrap(), instance, node }
 }
 
 /// Layer `edge`, on the broker of a node or of the layer.
 pub(crate) fn site(node: Option<&str>) -> Site {
-    Site {
-        layer: "edge".parse().unwrap(),
-        node: node.map(|node| node.parse().unwrap()),
-    }
+    Site { layer: "edge".parse().unwrap(), node: node.map(|node| node.parse().unwrap()) }
 }

@@ -15,7 +15,8 @@ pub struct Told {
 /// What follows from the changes since the last time.
 #[derive(Debug, Default)]
 pub struct Flushed {
-    /// In the order of the services; those of one service all with the same revision, or older ones.
+    /// In the order of the services; those of one service all with the same revision, or older
+    /// ones.
     pub notices: Vec<Notice>,
     /// Places that are told of changes from now on, whether there is a notice now or not.
     pub tracked: Vec<Place>,

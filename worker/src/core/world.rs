@@ -14,8 +14,8 @@ use super::place::{Place, Site};
 #[derive(Clone, Default)]
 pub(super) struct World {
     pub(super) state: State,
-    /// Uids of roll-outs that failed here, the oldest first: as long as the main service does not know, their change
-    /// does not count here.
+    /// Uids of roll-outs that failed here, the oldest first: as long as the main service does not
+    /// know, their change does not count here.
     pub(super) failed: Arc<Vec<String>>,
     /// Whether documents came from anywhere; without it nobody can be answered.
     pub(super) is_loaded: bool,

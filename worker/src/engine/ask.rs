@@ -37,7 +37,8 @@ impl Engine {
                     return;
                 }
                 let text = messages::refusal(&error, id.as_deref());
-                // Who can be told which of its requests it was hears of it where answers go that nobody chose.
+                // Who can be told which of its requests it was hears of it where answers go that
+                // nobody chose.
                 let to = reply_to.or_else(|| id.as_ref().and_then(|_| messages::default_reply()));
                 (to.map(|to| (to, id)), text)
             }
@@ -61,16 +62,15 @@ impl Engine {
         }
     }
 
-    /// What a request gets. Who was given a configuration without the texts of its secrets has the right hash, and yet not
-    /// what it needs.
+    /// What a request gets. Who was given a configuration without the texts of its secrets has the
+    /// right hash, and yet not what it needs.
     fn reply_to(&mut self, request: &GetRequest) -> Reply {
         let now = Instant::now();
         let reply = answer(&mut self.served, request, now.into_std());
-        if matches!(reply, Reply::Unchanged { .. }) && self.texts_until.is_some_and(|until| now < until) {
-            let anew = GetRequest {
-                hash: None,
-                ..request.clone()
-            };
+        if matches!(reply, Reply::Unchanged { .. })
+            && self.texts_until.is_some_and(|until| now < until)
+        {
+            let anew = GetRequest { hash: None, ..request.clone() };
             let whole = answer(&mut self.served, &anew, now.into_std());
             if let Reply::Standing(standing) = &whole
                 && secret::contains(standing.config.value())
@@ -82,9 +82,6 @@ impl Engine {
     }
 
     pub(super) fn freshness(&self) -> Freshness {
-        Freshness {
-            as_of: self.replica.as_of(),
-            now: now(),
-        }
+        Freshness { as_of: self.replica.as_of(), now: now() }
     }
 }

@@ -4,8 +4,9 @@
 //! deleted, untracked ─▶ ended ─▶ after STAYS: the broker's last notice is taken away ─▶ forgotten
 //! ```
 //!
-//! Meanwhile a worker that begins to notify repeats that a service was deleted: the one before may have died over it. The
-//! places are in the notes of the copies, so that a restart begins the time anew; the notices of deletions are not.
+//! Meanwhile a worker that begins to notify repeats that a service was deleted: the one before may
+//! have died over it. The places are in the notes of the copies, so that a restart begins the time
+//! anew; the notices of deletions are not.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -22,7 +23,8 @@ use crate::serve::{Told, changed};
 
 /// How long the last notice of a place stays with the broker.
 const STAYS: Duration = Duration::from_secs(600);
-/// How much longer a worker that does not notify remembers a place: the leader does the same, unless there is none.
+/// How much longer a worker that does not notify remembers a place: the leader does the same,
+/// unless there is none.
 const IN_MIND: Duration = Duration::from_secs(3_600);
 /// How long the channel stays after the last notice was taken away.
 const CHANNEL_STAYS: Duration = Duration::from_secs(60);
@@ -47,11 +49,7 @@ pub(super) struct Ends {
 
 impl Default for Ends {
     fn default() -> Self {
-        Self {
-            places: BTreeMap::new(),
-            channels_differ: true,
-            forgotten: 0,
-        }
+        Self { places: BTreeMap::new(), channels_differ: true, forgotten: 0 }
     }
 }
 
@@ -68,11 +66,7 @@ impl Ends {
             (ended.until, ended.is_taken_away) = (until, false);
             ended.notice = notice.cloned().or(ended.notice.take());
         } else if self.places.len() < MAX_ENDED {
-            let ended = Ended {
-                until,
-                notice: notice.cloned(),
-                is_taken_away: false,
-            };
+            let ended = Ended { until, notice: notice.cloned(), is_taken_away: false };
             self.places.insert(place.clone(), ended);
         } else {
             self.forgotten += 1;
@@ -107,15 +101,16 @@ impl Engine {
         self.ends.channels_differ |= kinds.into_iter().any(|kind| kind == Kind::Service);
     }
 
-    /// Has the channels of all services that are notified, or were a while ago. What is not shown yet comes with the flush
-    /// that shows it.
+    /// Has the channels of all services that are notified, or were a while ago. What is not shown
+    /// yet comes with the flush that shows it.
     pub(super) fn serve_channels(&mut self) {
         let Some(channels) = &self.outputs.channels else { return };
         if self.served.has_pending() || !std::mem::take(&mut self.ends.channels_differ) {
             return;
         }
         let of_documents = self.served.state().of_kind(Kind::Service, None);
-        let mut services: BTreeSet<ServiceName> = of_documents.map(|(key, _)| ServiceName::from(key.name())).collect();
+        let mut services: BTreeSet<ServiceName> =
+            of_documents.map(|(key, _)| ServiceName::from(key.name())).collect();
         // Programs are there also without a document.
         services.extend(PROGRAMS.iter().filter_map(|program| program.parse().ok()));
         services.extend(self.ends.places().map(|place| place.service.clone()));
@@ -129,10 +124,12 @@ impl Engine {
         let is_due = |ended: &Ended| ended.until + in_mind <= now;
         let due = self.ends.places.iter().filter(|(_, ended)| is_due(ended));
         let count = self.ends.places.len();
-        let due: Vec<(Place, bool)> = due.map(|(place, ended)| (place.clone(), ended.is_taken_away)).collect();
+        let due: Vec<(Place, bool)> =
+            due.map(|(place, ended)| (place.clone(), ended.is_taken_away)).collect();
         for (place, is_taken_away) in due {
             if self.outputs.speaker.is_waiting(&place.to_string()) {
-                // A record without a value would replace the deletion, and be lost with the channel.
+                // A record without a value would replace the deletion, and be lost with the
+                // channel.
                 if let Some(ended) = self.ends.places.get_mut(&place) {
                     ended.until = now + STAYS;
                 }
@@ -162,11 +159,7 @@ impl Engine {
         self.tell(vec![Told {
             place: place.to_string(),
             key: None,
-            notice: Some(KeyedMessage {
-                channel,
-                key: record_key(place),
-                value: None,
-            }),
+            notice: Some(KeyedMessage { channel, key: record_key(place), value: None }),
         }]);
     }
 }

@@ -34,13 +34,8 @@ impl Made {
 
 fn world(start: Option<Loaded>) -> (World, Arc<Made>) {
     let made = Arc::<Made>::default();
-    let world = world_on(
-        start,
-        true,
-        None,
-        Delivery::Text,
-        Some(Arc::clone(&made) as Arc<dyn Channels>),
-    );
+    let world =
+        world_on(start, true, None, Delivery::Text, Some(Arc::clone(&made) as Arc<dyn Channels>));
     (world, made)
 }
 
@@ -69,24 +64,23 @@ async fn channels_are_there_before_anything_is_said_and_what_is_over_is_taken_aw
     w.says(remove(4, late)).await;
     let seen = w.rest().await;
     assert!(
-        matches!(&seen[..], [.., Seen::Notice(channel, notice)] if channel.ends_with("/late") && notice["deleted"] == true),
+        matches!(
+            &seen[..],
+            [
+                ..,
+                Seen::Notice(channel, notice),
+            ] if channel.ends_with("/late") && notice["deleted"] == true,
+        ),
         "{seen:?}"
     );
     assert!(taken_away(&seen).is_empty());
-    assert_eq!(
-        made.last(),
-        ["late", "nav", "slam"],
-        "whoever comes late hears of the end"
-    );
+    assert_eq!(made.last(), ["late", "nav", "slam"], "whoever comes late hears of the end");
     tokio::time::sleep(LONG).await;
     let seen = w.rest().await;
     // The instance asked once and not again.
     let mut gone = taken_away(&seen);
     gone.sort_unstable();
-    assert_eq!(
-        gone,
-        [("blaze/config/changed/late", ""), ("blaze/config/changed/slam", "0")]
-    );
+    assert_eq!(gone, [("blaze/config/changed/late", ""), ("blaze/config/changed/slam", "0")]);
     assert_eq!(made.last(), ["nav", "slam"]);
     tokio::time::sleep(LONG).await;
     assert!(taken_away(&w.rest().await).is_empty(), "once");
@@ -103,7 +97,12 @@ async fn a_deletion_waits_for_a_broker_that_is_away_for_long() {
     assert_eq!(made.last(), ["nav", "slam"], "the channel is still needed");
     w.up.send_replace(true);
     let seen = w.rest().await;
-    let is_end = |seen: &Seen| matches!(seen, Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true);
+    let is_end = |seen: &Seen| {
+        matches!(
+            seen,
+            Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true,
+        )
+    };
     assert!(seen.iter().any(is_end), "{seen:?}");
     assert!(taken_away(&seen).is_empty());
     tokio::time::sleep(LONG).await;
@@ -117,19 +116,12 @@ async fn a_new_life_takes_away_what_ended_in_the_last_one() {
         ended: vec![place("late@robot-1"), place("nav@robot-1")],
         ..Notes::default()
     });
-    let (mut w, made) = world(Some(Loaded {
-        notes,
-        ..copy_of("s", 2, documents(30))
-    }));
+    let (mut w, made) = world(Some(Loaded { notes, ..copy_of("s", 2, documents(30)) }));
     w.rest().await;
     assert_eq!(made.last(), ["late", "nav", "slam"]);
     tokio::time::sleep(LONG).await;
     let gone = w.rest().await;
-    assert_eq!(
-        taken_away(&gone),
-        [("blaze/config/changed/late", "")],
-        "nav is there again"
-    );
+    assert_eq!(taken_away(&gone), [("blaze/config/changed/late", "")], "nav is there again");
     assert_eq!(made.last(), ["nav", "slam"]);
 }
 
@@ -178,9 +170,12 @@ async fn whoever_does_not_tell_takes_nothing_away_until_it_does() {
     w.leader.send_replace(Some(1));
     tokio::time::sleep(LONG).await;
     let seen = w.rest().await;
-    let end = seen.iter().position(
-        |seen| matches!(seen, Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true),
-    );
+    let end = seen.iter().position(|seen| {
+        matches!(
+            seen,
+            Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true,
+        )
+    });
     let away = seen
         .iter()
         .position(|seen| matches!(seen, Seen::TakenAway(channel, _) if channel.ends_with("/nav")));

@@ -11,8 +11,8 @@ use crate::core::messages::Delivery;
 use crate::core::{Applied, Incoming, PROTOCOL};
 use crate::sync::SyncEvent;
 
-/// After an outage services hear of the final state, not of each step to it: what they are told waits until everything up to
-/// where the store stood has come, or nothing comes for so long.
+/// After an outage services hear of the final state, not of each step to it: what they are told
+/// waits until everything up to where the store stood has come, or nothing comes for so long.
 const CATCH_UP: Duration = Duration::from_secs(3);
 /// The same, however much still comes.
 const CATCH_UP_AT_MOST: Duration = Duration::from_secs(30);
@@ -89,7 +89,8 @@ impl Engine {
                 }
                 self.reason = Some(reason);
                 self.replica.disconnected();
-                // A time that is still to come stays: else a link that comes and goes would put it off for ever.
+                // A time that is still to come stays: else a link that comes and goes would put it
+                // off for ever.
                 self.catching_up = self.catching_up.filter(|wait| wait.until > Instant::now());
                 self.note_sync();
             }
@@ -117,14 +118,16 @@ impl Engine {
             digest: resume.digest,
             without_texts: self.identity.delivery == Delivery::Redacted,
         };
-        // Texts come over a safe connection alone, and with a snapshot: what is here has the newest revision already.
+        // Texts come over a safe connection alone, and with a snapshot: what is here has the newest
+        // revision already.
         if self.wants_all || (is_safe && self.lacks_texts && !hello.without_texts) {
             (hello.store_id, hello.revision, hello.digest) = Default::default();
         }
         hello
     }
 
-    /// What nobody is told as text is not kept as text either. A main service that knows it does not send it.
+    /// What nobody is told as text is not kept as text either. A main service that knows it does
+    /// not send it.
     fn without_texts(&self, incoming: Incoming) -> Incoming {
         match self.identity.delivery {
             Delivery::Text => incoming,

@@ -6,10 +6,7 @@ use crate::core::{OLDEST_PROTOCOL, PROTOCOL};
 impl World {
     /// The main service goes on from what the worker has.
     pub(super) async fn goes_on(&self, protocol: u32, revision: u64) {
-        self.sync
-            .send(SyncEvent::Opened(CancellationToken::new()))
-            .await
-            .unwrap();
+        self.sync.send(SyncEvent::Opened(CancellationToken::new())).await.unwrap();
         self.says(Incoming::Welcome {
             protocol,
             store_id: "s".to_owned(),
@@ -70,7 +67,10 @@ async fn what_does_not_come_is_not_waited_for_for_long() {
 async fn where_nobody_is_told_texts_none_is_kept() {
     let mut w = world_as(None, true, None, Delivery::Redacted);
     assert!(w.hello().await.without_texts);
-    let secret = |text: &str| json!({ "config": { "password": { "$secret": { "text": text, "version": 2 } } } });
+    let secret = |text: &str| {
+        json!({ "config": { "password": { "$secret": { "text": text,
+        "version": 2 } } } })
+    };
     let mut all = documents(30);
     all[3] = document("Service/slam", 2, secret("canary"));
     // A main service of a version that does not know that none is wanted.
@@ -91,10 +91,9 @@ async fn where_nobody_is_told_texts_none_is_kept() {
 async fn why_a_stream_was_ended_is_known_afterwards() {
     let mut w = world();
     w.opens(documents(30), 2).await;
-    for (protocol, words) in [
-        (PROTOCOL + 1, Some("update the older of the two")),
-        (OLDEST_PROTOCOL, None),
-    ] {
+    for (protocol, words) in
+        [(PROTOCOL + 1, Some("update the older of the two")), (OLDEST_PROTOCOL, None)]
+    {
         w.closes().await;
         w.goes_on(protocol, 2).await;
         w.rest().await;
@@ -128,10 +127,7 @@ async fn what_is_due_is_not_put_off_by_what_keeps_coming() {
         }
         tokio::time::advance(Duration::from_millis(50)).await;
     }
-    assert!(
-        w.acks.has_changed().unwrap(),
-        "the main service is told within three seconds"
-    );
+    assert!(w.acks.has_changed().unwrap(), "the main service is told within three seconds");
 }
 
 #[tokio::test(start_paused = true)]
@@ -145,8 +141,7 @@ async fn texts_that_come_in_the_middle_of_what_was_missed_are_told_with_the_rest
     let mut w = world_from(Some(copy_of("s", 2, all)), true);
     w.rest().await;
     w.goes_on(PROTOCOL, 5).await;
-    w.says(put(3, secret(3, json!({ "text": "canary", "version": 2 }))))
-        .await;
+    w.says(put(3, secret(3, json!({ "text": "canary", "version": 2 })))).await;
     tokio::time::sleep(Duration::from_secs(1)).await;
     assert_eq!(w.slam().await["config"]["rate_hz"], 2, "no step is shown");
     for revision in 4..=5 {
@@ -154,10 +149,7 @@ async fn texts_that_come_in_the_middle_of_what_was_missed_are_told_with_the_rest
         w.says(put(revision, later)).await;
     }
     let told = w.rest().await;
-    assert!(
-        rates(&told).iter().all(|rate| *rate == 5) && !told.is_empty(),
-        "{told:?}"
-    );
+    assert!(rates(&told).iter().all(|rate| *rate == 5) && !told.is_empty(), "{told:?}");
     assert_eq!(w.slam().await["config"]["password"], "canary");
 }
 
@@ -188,8 +180,5 @@ async fn whose_answer_could_go_nowhere_is_told_so_where_all_are_answered() {
     w.gets.send(Bytes::from(request.to_string())).await.unwrap();
     let (to, answer) = w.answers.recv().await.unwrap();
     assert_eq!(to, "blaze/reply/config");
-    assert_eq!(
-        (&answer["id"], &answer["error"]["code"]),
-        (&json!("7"), &json!("invalid_request"))
-    );
+    assert_eq!((&answer["id"], &answer["error"]["code"]), (&json!("7"), &json!("invalid_request")));
 }

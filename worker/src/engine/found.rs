@@ -1,4 +1,5 @@
-//! What a copy holds that could not be read at the start, or that another worker of the layer has written.
+//! What a copy holds that could not be read at the start, or that another worker of the layer has
+//! written.
 
 use tokio::time::Instant;
 
@@ -7,14 +8,11 @@ use crate::copy::{Found, Loaded, Notes};
 use crate::core::Replica;
 
 impl Engine {
-    /// Of one store the newer state counts; of two, what is served stays, and so it does if the main service answers: it tells
-    /// what is newer by itself. Notes count in any case, unless another worker wrote them just now.
+    /// Of one store the newer state counts; of two, what is served stays, and so it does if the
+    /// main service answers: it tells what is newer by itself. Notes count in any case, unless
+    /// another worker wrote them just now.
     pub(super) fn on_found(&mut self, found: Found) {
-        let Loaded {
-            position,
-            documents,
-            notes,
-        } = found.loaded;
+        let Loaded { position, documents, notes } = found.loaded;
         let is_newer = self.replica.store_id().is_none_or(|store_id| {
             store_id == position.store_id && position.revision > self.replica.state().revision()
         });

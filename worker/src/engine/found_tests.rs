@@ -12,12 +12,7 @@ impl World {
     async fn finds_of(&self, is_of_another: bool, loaded: Loaded) {
         let (taken, is_taken) = oneshot::channel();
         let place = "database".to_owned();
-        let found = Found {
-            place,
-            loaded,
-            is_of_another,
-            taken,
-        };
+        let found = Found { place, loaded, is_of_another, taken };
         self.found.send(found).await.unwrap();
         is_taken.await.unwrap();
     }
@@ -41,7 +36,8 @@ async fn what_the_database_has_newer_is_served_before_the_main_service_answers()
     w.rest().await;
     assert_eq!(w.rate().await, 40);
     assert_eq!(w.hello().await.revision, 4);
-    // Also what the main service told before it went away may be the older one: another worker of the layer writes there.
+    // Also what the main service told before it went away may be the older one: another worker of
+    // the layer writes there.
     w.opens(documents(50), 5).await;
     w.rest().await;
     w.closes().await;
@@ -74,10 +70,7 @@ async fn what_is_found_is_better_than_the_mounted_file() {
     w.rest().await;
     w.finds(copy_of("s", 4, documents(40))).await;
     let (_, notice) = w.notice().await;
-    assert_eq!(
-        (&notice["config"]["rate_hz"], &notice["source"]),
-        (&json!(40), &json!("copy"))
-    );
+    assert_eq!((&notice["config"]["rate_hz"], &notice["source"]), (&json!(40), &json!("copy")));
 }
 
 #[tokio::test(start_paused = true)]
@@ -97,11 +90,8 @@ async fn notes_of_another_worker_count_with_its_documents_alone() {
 async fn texts_of_secrets_that_are_found_are_told() {
     let with = |revision, value: Value| {
         let mut all = documents(30);
-        all[3] = document(
-            "Service/slam",
-            2,
-            json!({ "config": { "password": { "$secret": value } } }),
-        );
+        all[3] =
+            document("Service/slam", 2, json!({ "config": { "password": { "$secret": value } } }));
         copy_of("s", revision, all)
     };
     let mut w = world_from(Some(with(2, json!({ "redacted": true, "version": 2 }))), true);
@@ -109,9 +99,20 @@ async fn texts_of_secrets_that_are_found_are_told() {
     w.rest().await;
     w.finds(with(3, json!({ "text": "canary", "version": 2 }))).await;
     let told = w.rest().await;
-    let is_key = |seen: &Seen| matches!(seen, Seen::Key(_, Some(value)) if value["config"]["password"] == "canary");
+    let is_key = |seen: &Seen| {
+        matches!(
+            seen,
+            Seen::Key(_, Some(value)) if value["config"]["password"] == "canary",
+        )
+    };
     assert!(told.iter().any(is_key), "{told:?}");
-    let request = json!({ "id": "1", "service": "slam", "instance": "0", "hash": hash, "reply_to": "blaze/reply/t" });
+    let request = json!({
+        "id": "1",
+        "service": "slam",
+        "instance": "0",
+        "hash": hash,
+        "reply_to": "blaze/reply/t",
+    });
     assert_eq!(w.asks(request).await["config"]["password"], "canary");
 }
 
@@ -123,15 +124,8 @@ async fn a_roll_out_that_failed_in_another_life_is_undone() {
     let mut w = world_from(Some(copy_of("s", 2, documents.clone())), true);
     w.rest().await;
     assert_eq!(w.rate().await, 500);
-    let notes = Arc::new(Notes {
-        failed: vec!["u-1".to_owned()],
-        ..Notes::default()
-    });
-    w.finds(Loaded {
-        notes,
-        ..copy_of("s", 2, documents)
-    })
-    .await;
+    let notes = Arc::new(Notes { failed: vec!["u-1".to_owned()], ..Notes::default() });
+    w.finds(Loaded { notes, ..copy_of("s", 2, documents) }).await;
     assert_eq!(w.rates().await, [json!(30)]);
     assert_eq!(w.status().await.json["rollouts"][0]["phase"], "failed");
 }

@@ -85,10 +85,15 @@ impl Engine {
         for complaint in complaints {
             for failure in self.gate.complain(&self.served, complaint, now) {
                 let reason = failure.reason.as_str();
-                tracing::warn!(rollout = %failure.name, reason, "a roll-out has failed here and is undone");
+                tracing::warn!(
+                    rollout = %failure.name,
+                    reason,
+                    "a roll-out has failed here and is undone",
+                );
                 self.counts.failed_rollouts += 1;
                 self.served.fail_rollout(&failure.uid);
-                // A new life must not try it again, whether it tells anybody of the former configuration or not.
+                // A new life must not try it again, whether it tells anybody of the former
+                // configuration or not.
                 self.renew_notes();
                 self.keep(true);
                 if let Some(copies) = &self.outputs.copies {
@@ -103,7 +108,8 @@ impl Engine {
         }
     }
 
-    /// Roll-outs that began or ended with what is shown, and windows of those that services were told of by now.
+    /// Roll-outs that began or ended with what is shown, and windows of those that services were
+    /// told of by now.
     pub(super) fn follow_rollouts(&mut self) {
         if self.gate.follow(&self.served) {
             self.acknowledge_soon();
@@ -118,7 +124,8 @@ impl Engine {
         }
     }
 
-    /// Revision up to which services were notified: by this worker, since it notified all, or else by others.
+    /// Revision up to which services were notified: by this worker, since it notified all, or else
+    /// by others.
     fn told_up_to(&self) -> Option<u64> {
         if self.tells {
             return self.delivered(false).filter(|_| self.has_announced);
@@ -135,12 +142,13 @@ impl Engine {
         }
     }
 
-    /// How roll-outs go on the nodes that are served here. On the broker of a layer these are the nodes that anything was
-    /// heard from: the others have brokers and workers of their own.
+    /// How roll-outs go on the nodes that are served here. On the broker of a layer these are the
+    /// nodes that anything was heard from: the others have brokers and workers of their own.
     pub(super) fn rollouts(&self) -> Vec<RolloutState> {
         let own = &self.identity.node;
-        self.gate
-            .states(|node| node == own || self.served.is_asked_from(node) || self.signs.is_heard_from(node))
+        self.gate.states(|node| {
+            node == own || self.served.is_asked_from(node) || self.signs.is_heard_from(node)
+        })
     }
 
     pub(super) fn services_of_ack(&self) -> Vec<v1::ServiceState> {

@@ -11,8 +11,10 @@ use crate::core::testing::labelled;
 
 /// A roll-out of another rate of `slam` on `robot-1`, watched for 60 s.
 pub(super) fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
-    let spec = json!({ "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "rate_hz": rate } },
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 } });
+    let spec = json!({ "target": { "kind": "Service", "name": "slam" },
+        "patch": { "config": { "rate_hz": rate } },
+        "canary": { "node_selector": "canary=true" },
+        "gate": { "window_s": 60, "max_unhealthy": 0 } });
     let mut out = document("Rollout/faster", revision, spec);
     out.uid = uid.to_owned();
     out.status = Some(json!({ "phase": "canary" }));
@@ -22,29 +24,22 @@ pub(super) fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
 pub(super) fn canary_documents() -> Vec<Document> {
     let mut out = documents(30);
     out.retain(|document| document.key.to_string() != "Node/robot-1");
-    out.push(labelled(
-        "Node/robot-1",
-        2,
-        json!({ "layer": "edge" }),
-        ("canary", "true"),
-    ));
+    out.push(labelled("Node/robot-1", 2, json!({ "layer": "edge" }), ("canary", "true")));
     out
 }
 
 fn copies() -> (Supervisor, Arc<Fake>, Copies) {
     let supervisor = Supervisor::new("test");
     let fake = Arc::new(Fake::new("fake"));
-    let target = Target {
-        copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
-        is_read: true,
-        written: None,
-    };
+    let target =
+        Target { copy: Arc::clone(&fake) as Arc<dyn LocalCopy>, is_read: true, written: None };
     let copies = Copies::start(&supervisor, vec![target], &mpsc::channel(1).0);
     (supervisor, fake, copies)
 }
 
 fn beat(instance: &str, state: &str) -> Value {
-    json!({ "layer": "edge", "node": "robot-1", "service": "slam", "instance": instance, "epoch": 1, "state": state,
+    json!({ "layer": "edge", "node": "robot-1", "service": "slam", "instance": instance, "epoch": 1,
+        "state": state,
         "config_revision": 2, "config_hash": "sha256:ab", "ttl_ms": 15000 })
 }
 
@@ -70,16 +65,14 @@ impl World {
     }
 
     pub(super) async fn acks(&self, instance: &str, hash: &Value, status: &str) {
-        let ack = json!({ "service": "slam", "instance": instance, "node": "robot-1", "revision": 9, "hash": hash,
+        let ack = json!({ "service": "slam", "instance": instance, "node": "robot-1", "revision": 9,
+            "hash": hash,
             "status": status, "detail": "too fast" });
         self.signs.send(Sign::Ack(Bytes::from(ack.to_string()))).await.unwrap();
     }
 
     async fn beats(&self, message: &Value) {
-        self.signs
-            .send(Sign::Beat(Bytes::from(message.to_string())))
-            .await
-            .unwrap();
+        self.signs.send(Sign::Beat(Bytes::from(message.to_string()))).await.unwrap();
     }
 
     async fn reported(&mut self, phase: &str) -> v1::RolloutReport {
@@ -104,10 +97,7 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away_after_a_r
     assert_eq!(w.reported("applied").await.uid, "u-1");
     w.closes().await;
     let bad = w.slam().await;
-    assert_eq!(
-        (&bad["config"]["rate_hz"], &bad["rollout"]),
-        (&json!(500), &json!("faster"))
-    );
+    assert_eq!((&bad["config"]["rate_hz"], &bad["rollout"]), (&json!(500), &json!("faster")));
     w.acks("0", &bad["hash"], "rejected").await;
     assert_eq!(w.rates().await, [json!(30)]);
     let status = w.status().await;
@@ -126,20 +116,13 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away_after_a_r
     let mut w = world_with(Some(loaded), true, Some(copies));
     assert_eq!(w.rates().await, [] as [Value; 0], "it was told already");
     let good = w.slam().await;
-    assert_eq!(
-        (&good["config"]["rate_hz"], &good["rollout"]),
-        (&json!(30), &json!(null))
-    );
+    assert_eq!((&good["config"]["rate_hz"], &good["rollout"]), (&json!(30), &json!(null)));
     // The main service is back and does not know yet.
     let mut documents = canary_documents();
     documents.push(rollout(3, "u-1", 500));
     w.opens(documents.clone(), 3).await;
     assert_eq!(w.reported("failed").await.node, "robot-1");
-    assert_eq!(
-        w.rates().await,
-        [json!(30)],
-        "every place once, none with the bad value"
-    );
+    assert_eq!(w.rates().await, [json!(30)], "every place once, none with the bad value");
     // Another one of the same name may be tried.
     assert_eq!(w.tries(4, "u-2", 40).await, [json!(40)]);
     assert_eq!(w.reported("applied").await.uid, "u-2");
@@ -151,15 +134,9 @@ async fn a_lost_watchdog_fails_it() {
     w.beats(&beat("0", "ready")).await;
     assert_eq!(w.tries(3, "u-1", 500).await, [json!(500)]);
     w.beats(&beat("0", "ready")).await;
-    let ack = w
-        .acks
-        .wait_for(|ack| ack.as_ref().is_some_and(|ack| !ack.services.is_empty()))
-        .await;
+    let ack = w.acks.wait_for(|ack| ack.as_ref().is_some_and(|ack| !ack.services.is_empty())).await;
     let services = ack.unwrap().as_ref().unwrap().services.clone();
-    assert_eq!(
-        (services[0].service.as_str(), services[0].state.as_str()),
-        ("slam", "ready")
-    );
+    assert_eq!((services[0].service.as_str(), services[0].state.as_str()), ("slam", "ready"));
     assert_eq!((services[0].config_revision, services[0].node.as_str()), (2, "robot-1"));
     // It counts for 15 s.
     for _ in 0..2 {
@@ -177,13 +154,13 @@ async fn a_record_that_is_gone_from_redis_fails_it_and_an_outage_does_not() {
         .unwrap()
         .iter()
         .map(|(name, value)| {
-            (
-                name.clone(),
-                value.as_str().map_or_else(|| value.to_string(), str::to_owned),
-            )
+            (name.clone(), value.as_str().map_or_else(|| value.to_string(), str::to_owned))
         })
         .collect();
-    let scan = |records: Vec<(String, BTreeMap<String, String>)>, is_whole| Sign::Scan { records, is_whole };
+    let scan = |records: Vec<(String, BTreeMap<String, String>)>, is_whole| Sign::Scan {
+        records,
+        is_whole,
+    };
     let one = || {
         let strange = ("blaze:watchdog:slam:robot-1:7".to_owned(), members.clone());
         vec![("blaze:watchdog:slam:robot-1:0".to_owned(), members.clone()), strange]
@@ -197,10 +174,7 @@ async fn a_record_that_is_gone_from_redis_fails_it_and_an_outage_does_not() {
         .iter()
         .find(|row| row["instance"] == "0")
         .unwrap();
-    assert_eq!(
-        (&slam["state"], &slam["config_hash"]),
-        (&json!("ready"), &json!("sha256:ab"))
-    );
+    assert_eq!((&slam["state"], &slam["config_hash"]), (&json!("ready"), &json!("sha256:ab")));
     assert_eq!((status.counts.signs, status.counts.misunderstood), (1, 1));
     w.signs.send(scan(Vec::new(), false)).await.unwrap();
     assert_eq!(w.rates().await, [] as [Value; 0]);
@@ -243,8 +217,7 @@ async fn a_new_leader_opens_windows_when_the_broker_has_its_first_notices() {
     documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
     w.opens(documents, 2).await;
     assert_eq!(w.tries(3, "u-1", 500).await, [] as [Value; 0]);
-    w.says(put(4, document("Service/nav", 4, json!({ "config": { "speed": 2 } }))))
-        .await;
+    w.says(put(4, document("Service/nav", 4, json!({ "config": { "speed": 2 } })))).await;
     w.rest().await;
     w.up.send_replace(false);
     w.leader.send_replace(Some(1));

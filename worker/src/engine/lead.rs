@@ -5,7 +5,8 @@
 //! else                                               ──▶ follows: what changes is not kept, for the next leader notifies all
 //! ```
 //!
-//! Receivers drop a notice with the hash that they have, so a repeat costs a message and no call of a service.
+//! Receivers drop a notice with the hash that they have, so a repeat costs a message and no call of
+//! a service.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -26,8 +27,9 @@ impl Engine {
         self.leads.is_some() && self.outputs.term.is_on()
     }
 
-    /// This worker answers and notifies from now on, or does not any more. Of two terms one ends before the other begins,
-    /// also if nobody looked in between: others may have notified something newer.
+    /// This worker answers and notifies from now on, or does not any more. Of two terms one ends
+    /// before the other begins, also if nobody looked in between: others may have notified
+    /// something newer.
     pub(super) fn lead(&mut self, term: Option<u64>) {
         if self.leads == term {
             return;
@@ -40,7 +42,10 @@ impl Engine {
         self.led_at = Instant::now();
         self.begin_telling();
         if self.leads.is_some() && !self.tells {
-            tracing::info!("services were notified of a later state than is known here; they are notified once it is");
+            tracing::info!(
+                "services were notified of a later state than is known here; they are notified \
+                 once it is"
+            );
         }
     }
 
@@ -59,9 +64,9 @@ impl Engine {
         })
     }
 
-    /// Whether services were notified of more than is known here. What the main service calls the newest some time after
-    /// this worker began to lead is not behind, whatever the mark says; before, its word may be one from before the process
-    /// was stopped.
+    /// Whether services were notified of more than is known here. What the main service calls the
+    /// newest some time after this worker began to lead is not behind, whatever the mark says;
+    /// before, its word may be one from before the process was stopped.
     fn is_behind(&self) -> bool {
         match (&self.noted, &self.shown) {
             (None, _) => false,
@@ -73,7 +78,8 @@ impl Engine {
         }
     }
 
-    /// Notifies from now on, if it leads and knows enough: keys first, for they may be those of an older state.
+    /// Notifies from now on, if it leads and knows enough: keys first, for they may be those of an
+    /// older state.
     pub(super) fn begin_telling(&mut self) {
         if !self.tells && self.leads.is_some() && !self.is_behind() {
             self.tells = true;
@@ -103,8 +109,9 @@ impl Engine {
         }
     }
 
-    /// Whether every place is to be notified once: other workers, or another life, may have died before they did. A copy
-    /// may be older than what services were notified of, so it is announced only if a mark says that it is not.
+    /// Whether every place is to be notified once: other workers, or another life, may have died
+    /// before they did. A copy may be older than what services were notified of, so it is announced
+    /// only if a mark says that it is not.
     pub(super) fn may_announce(&self) -> bool {
         let is_newest = match self.served.source() {
             Some(Source::Main | Source::File) => true,
@@ -126,7 +133,8 @@ impl Engine {
         self.tell(told);
     }
 
-    /// What waits may be old by the time the broker takes it; whoever leads next notifies every place.
+    /// What waits may be old by the time the broker takes it; whoever leads next notifies every
+    /// place.
     fn stop_telling(&mut self) {
         if !std::mem::replace(&mut self.tells, false) {
             return;
@@ -143,7 +151,8 @@ impl Engine {
         self.settle_at.get_or_insert(Instant::now() + SETTLE);
     }
 
-    /// Looks what the broker has taken meanwhile, leaves a mark for whoever leads next, and has new places kept.
+    /// Looks what the broker has taken meanwhile, leaves a mark for whoever leads next, and has new
+    /// places kept.
     pub(super) fn settle(&mut self) {
         self.settle_at = None;
         if self.tells {
@@ -162,7 +171,8 @@ impl Engine {
         self.shown.as_ref().map_or("", |shown| &shown.store_id)
     }
 
-    /// Revision up to which the broker has taken all notices. `aside`: also those whose channel cannot be made yet.
+    /// Revision up to which the broker has taken all notices. `aside`: also those whose channel
+    /// cannot be made yet.
     pub(super) fn delivered(&self, aside: bool) -> Option<u64> {
         match self.outputs.speaker.waits_since(self.shown_store(), aside) {
             None => Some(self.served.state().revision()),
@@ -174,10 +184,7 @@ impl Engine {
         let (Some(shown), Some(revision)) = (&self.shown, self.delivered(true)) else {
             return;
         };
-        let mark = Mark {
-            revision,
-            ..shown.clone()
-        };
+        let mark = Mark { revision, ..shown.clone() };
         self.outputs.told.send_if_modified(|left| {
             // A repeated notice does not set the mark back.
             let mut known = left.iter().chain(&self.noted);

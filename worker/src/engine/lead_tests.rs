@@ -4,10 +4,7 @@ use super::*;
 use crate::serve::SpeakerCounts;
 
 fn mark(revision: u64) -> Mark {
-    Mark {
-        store_id: "s".to_owned(),
-        revision,
-    }
+    Mark { store_id: "s".to_owned(), revision }
 }
 
 /// Revisions and rates in notices of `slam`.
@@ -23,7 +20,9 @@ fn notices(seen: &[Seen]) -> Vec<(u64, u64)> {
 
 fn key_of_slam(seen: &[Seen]) -> Option<u64> {
     seen.iter().rev().find_map(|seen| match seen {
-        Seen::Key(key, Some(value)) if key == "blaze:config:slam" => value["config"]["rate_hz"].as_u64(),
+        Seen::Key(key, Some(value)) if key == "blaze:config:slam" => {
+            value["config"]["rate_hz"].as_u64()
+        }
         Seen::Key(..) | Seen::Notice(..) | Seen::TakenAway(..) => None,
     })
 }
@@ -69,7 +68,8 @@ async fn whoever_begins_to_lead_notifies_every_place_once() {
 #[tokio::test(start_paused = true)]
 async fn a_copy_is_announced_only_if_services_were_not_notified_of_more() {
     let copy = || copy_of("s", 2, documents(30));
-    // Alone, and without the main service: nobody knows how old the copy is. Keys are there nevertheless.
+    // Alone, and without the main service: nobody knows how old the copy is. Keys are there
+    // nevertheless.
     let mut w = world_from(Some(copy()), true);
     let told = w.rest().await;
     assert_eq!((notices(&told), key_of_slam(&told)), (vec![], Some(30)));
@@ -98,11 +98,8 @@ async fn whoever_leads_leaves_how_far_the_broker_has_taken_it() {
     w.rest().await;
     assert_eq!(*w.told.borrow(), Some(mark(3)));
     // A commit that concerns nobody moves the mark on all the same.
-    let same = document(
-        "Service/slam",
-        4,
-        json!({ "config": { "rate_hz": 10 }, "description": "new" }),
-    );
+    let same =
+        document("Service/slam", 4, json!({ "config": { "rate_hz": 10 }, "description": "new" }));
     w.says(put(4, same)).await;
     w.rest().await;
     assert_eq!(*w.told.borrow(), Some(mark(4)));
@@ -129,7 +126,12 @@ async fn what_waited_when_the_lease_was_lost_is_told_when_it_is_had_again() {
     w.leader.send_replace(Some(2));
     let told = w.rest().await;
     assert_eq!(notices(&told), [(4, 10)]);
-    let is_nav = |seen: &&Seen| matches!(seen, Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true);
+    let is_nav = |seen: &&Seen| {
+        matches!(
+            seen,
+            Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true,
+        )
+    };
     assert_eq!(told.iter().filter(is_nav).count(), 1, "{told:?}");
 }
 
@@ -141,7 +143,8 @@ async fn between_two_terms_nothing_is_carried_over_and_everything_told_anew() {
     w.up.send_replace(false);
     w.says(slam(3, 10)).await;
     tokio::time::sleep(Duration::from_secs(5)).await;
-    // It was stopped for a while, others led, and it leads again: it sees only that it is another term.
+    // It was stopped for a while, others led, and it leads again: it sees only that it is another
+    // term.
     w.noted.send_replace(Some(mark(9)));
     w.leader.send_replace(Some(2));
     w.closes().await;

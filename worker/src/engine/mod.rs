@@ -1,5 +1,6 @@
-//! The worker at work: one task that owns what is known and does one thing after the other, so that nothing needs a lock and
-//! every order is kept. It waits for nobody: what goes out is taken by tasks of their own.
+//! The worker at work: one task that owns what is known and does one thing after the other, so that
+//! nothing needs a lock and every order is kept. It waits for nobody: what goes out is taken by
+//! tasks of their own.
 //!
 //! ```text
 //! sync::follow ──SyncEvent──▶┌────────┐──Ack (newest)──▶ sync::follow
@@ -50,7 +51,8 @@ const TOGETHER: Duration = Duration::from_millis(20);
 const SETTLE: Duration = Duration::from_millis(200);
 /// What the worker has is said this long after it became so, and with it what came meanwhile.
 const ACK_AFTER: Duration = Duration::from_millis(50);
-/// While there is always something new it is said so often: the digest over everything is worked out each time.
+/// While there is always something new it is said so often: the digest over everything is worked
+/// out each time.
 const ACK_PACE: Duration = Duration::from_secs(1);
 /// It is said again after this time without news.
 const ACK_AGAIN: Duration = Duration::from_secs(15);
@@ -74,7 +76,8 @@ pub struct Engine {
     lacks_texts: bool,
     /// It has come, and nobody has been told yet.
     owes_texts: bool,
-    /// Until then whoever has secrets gets everything, also if the hash is the same: the texts have come just now.
+    /// Until then whoever has secrets gets everything, also if the hash is the same: the texts have
+    /// come just now.
     texts_until: Option<Instant>,
     signs: Signs,
     gate: Gate,
@@ -161,12 +164,7 @@ impl Engine {
     }
 
     fn begin_with(&mut self, loaded: Loaded, now: Instant) {
-        let Position {
-            store_id,
-            revision,
-            as_of,
-            ..
-        } = loaded.position;
+        let Position { store_id, revision, as_of, .. } = loaded.position;
         let state = self.state_of(revision, loaded.documents.iter().cloned());
         let is_same = |document: &Arc<Document>| {
             let held = state.get(&document.key);
@@ -180,7 +178,8 @@ impl Engine {
         self.lacks_texts = lacks_texts(self.replica.state());
         self.note_all_services();
         self.flush_at = Some(now);
-        // The one of the copies that is behind the other catches up; both lose the texts that nobody is told.
+        // The one of the copies that is behind the other catches up; both lose the texts that
+        // nobody is told.
         self.keep(!is_as_kept);
     }
 
@@ -209,7 +208,8 @@ impl Engine {
             tokio::select! {
                 biased;
                 () = stop.cancelled() => return,
-                () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
+                () = sleep_until(flush_at.unwrap_or_else(Instant::now)),
+                if flush_at.is_some() => self.flush(),
                 Some(asked) = inputs.queries.recv() => {
                     // Whoever asked may have gone.
                     let _ = asked.send(self.status());
@@ -224,12 +224,14 @@ impl Engine {
                     let term = *inputs.leader.borrow_and_update();
                     self.lead(term);
                 }
-                // What is due is done before what comes, of which there may always be more. Each of these is due again only later.
+                // What is due is done before what comes, of which there may always be more. Each of
+                // these is due again only later.
                 () = sleep_until(self.look_at) => {
                     self.look_at_signs();
                     self.look_at_ends();
                 }
-                () = sleep_until(settle_at.unwrap_or_else(Instant::now)), if settle_at.is_some() => self.settle(),
+                () = sleep_until(settle_at.unwrap_or_else(Instant::now)),
+                if settle_at.is_some() => self.settle(),
                 () = sleep_until(self.ack_at) => self.acknowledge(),
                 Some(event) = inputs.sync.recv() => self.on_sync(event),
                 Some(sign) = inputs.signs.recv() => self.on_sign(sign),
@@ -286,10 +288,7 @@ impl Engine {
             self.renew_notes();
             // The revision of the documents is kept with them.
             let revision = self.replica.state().revision();
-            let kept = |notes: &Notes| Notes {
-                floor: notes.floor.max(revision),
-                ..notes.clone()
-            };
+            let kept = |notes: &Notes| Notes { floor: notes.floor.max(revision), ..notes.clone() };
             if kept(&before) != kept(&self.notes) {
                 self.keep(true);
             }
@@ -327,15 +326,15 @@ impl Engine {
     }
 }
 
-/// Whether the text of a secret is not here: it came over a connection that others could read, or from a copy without a key.
+/// Whether the text of a secret is not here: it came over a connection that others could read, or
+/// from a copy without a key.
 fn lacks_texts(state: &State) -> bool {
     state.all().any(|(_, held)| lacks_text(&held.document.spec))
 }
 
 /// The time, for people.
 fn now() -> Timestamp {
-    let since = std::time::SystemTime::now()
-        .duration_since(std::time::UNIX_EPOCH)
-        .unwrap_or_default();
+    let since =
+        std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
     Timestamp::from_millis(i64::try_from(since.as_millis()).unwrap_or(i64::MAX))
 }

@@ -10,8 +10,8 @@ use super::Engine;
 use crate::core::messages::Delivery;
 use crate::core::{Place, Standing};
 
-/// Sections that count for a worker. How it reaches the main service and where it keeps its copies is for the node file alone:
-/// a slip there could not be taken back from afar.
+/// Sections that count for a worker. How it reaches the main service and where it keeps its copies
+/// is for the node file alone: a slip there could not be taken back from afar.
 const SECTIONS: [&str; 1] = ["log"];
 
 /// The worker as a service among others.
@@ -41,9 +41,8 @@ impl Engine {
 fn overlay(standing: &Standing) -> Overlay {
     // It stays in this process.
     let config = Delivery::Text.form(standing.config.value());
-    let sections = SECTIONS
-        .iter()
-        .filter_map(|name| Some(((*name).to_owned(), config.get(name)?.clone())));
+    let sections =
+        SECTIONS.iter().filter_map(|name| Some(((*name).to_owned(), config.get(name)?.clone())));
     let tree: Map<String, Value> = sections.collect();
     Overlay {
         origin: Arc::from("BlazeConfig"),

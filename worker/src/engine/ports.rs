@@ -24,7 +24,8 @@ pub trait Replies: Send + Sync + 'static {
     /// For people.
     fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String>;
 
-    /// The one channel that all answers go to, where the broker cannot make one for each who asks; then an id is needed.
+    /// The one channel that all answers go to, where the broker cannot make one for each who asks;
+    /// then an id is needed.
     fn shared(&self) -> Option<ChannelName>;
 }
 

@@ -31,10 +31,7 @@ pub struct Status {
 impl Engine {
     pub(super) fn status(&mut self) -> Status {
         let site = self.identity.site.clone();
-        let freshness = Freshness {
-            as_of: self.replica.as_of(),
-            now: now(),
-        };
+        let freshness = Freshness { as_of: self.replica.as_of(), now: now() };
         let digest = self.replica.digest();
         let services = self.services();
         let rollouts = self.rollouts().into_iter().map(|state| {
@@ -77,7 +74,8 @@ impl Engine {
         }
     }
 
-    /// What services are told, and how they say they are; those that are not told of changes come last.
+    /// What services are told, and how they say they are; those that are not told of changes come
+    /// last.
     fn services(&self) -> Vec<Value> {
         let told = self
             .served
@@ -98,10 +96,13 @@ impl Engine {
 
 fn service(place: &Place, told: Option<&Told>, row: Option<&Row>) -> Value {
     json!({
-        "service": place.service.as_str(), "instance": place.instance.as_ref().map(InstanceName::as_str),
+        "service": place.service.as_str(),
+        "instance": place.instance.as_ref().map(InstanceName::as_str),
         "node": place.node.as_ref().map(NodeName::as_str),
-        "revision": told.map(|told| told.revision), "hash": told.and_then(|told| told.hash.as_deref()),
-        "state": row.map(|row| row.health.as_str()), "config_revision": row.map(|row| row.config_revision),
+        "revision": told.map(|told| told.revision),
+        "hash": told.and_then(|told| told.hash.as_deref()),
+        "state": row.map(|row| row.health.as_str()),
+        "config_revision": row.map(|row| row.config_revision),
         "config_hash": row.map(|row| row.config_hash.as_str()),
     })
 }

@@ -15,12 +15,13 @@ use crate::core::messages::{self, Delivery, GetRequest};
 use crate::core::{Change, Flushed, Notice, Place, Standing};
 use crate::serve::{Told, changed};
 
-/// How long after the texts of secrets came everybody with secrets gets a whole answer: each asks within this time.
+/// How long after the texts of secrets came everybody with secrets gets a whole answer: each asks
+/// within this time.
 const TEXTS: Duration = Duration::from_secs(180);
 
 impl Engine {
-    /// Has changes told: at once after a quiet while, else together with what comes until then. What was missed in an outage
-    /// is told when it has all come.
+    /// Has changes told: at once after a quiet while, else together with what comes until then.
+    /// What was missed in an outage is told when it has all come.
     pub(super) fn flush_soon(&mut self) {
         let next = self.flushed.map_or_else(Instant::now, |last| last + TOGETHER);
         let next = self.catching_up.map_or(next, |wait| wait.until.max(next));
@@ -32,16 +33,13 @@ impl Engine {
         self.flush_at = None;
         let instant = Instant::now();
         self.flushed = Some(instant);
-        let Flushed {
-            notices,
-            tracked,
-            untracked,
-        } = self.served.flush(instant.into_std());
+        let Flushed { notices, tracked, untracked } = self.served.flush(instant.into_std());
         self.shown = self.mark();
         // Those that are announced now make up for earlier states as well.
         let state = self.shown.clone().filter(|_| self.has_announced);
         self.outputs.speaker.set_state(state);
-        let is_first = self.served.is_ready() && !std::mem::replace(&mut self.has_swept, self.served.is_ready());
+        let is_first = self.served.is_ready()
+            && !std::mem::replace(&mut self.has_swept, self.served.is_ready());
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
@@ -63,7 +61,8 @@ impl Engine {
                 told.extend(self.of_notice(notice));
             }
         }
-        let noticed: BTreeSet<Place> = changed.into_iter().chain(gone).map(|notice| notice.place).collect();
+        let noticed: BTreeSet<Place> =
+            changed.into_iter().chain(gone).map(|notice| notice.place).collect();
         // What an earlier life wrote may be gone, or of another form.
         let all = if is_first { self.places() } else { tracked };
         for place in all.iter().filter(|place| !noticed.contains(place)) {
@@ -92,8 +91,9 @@ impl Engine {
         self.served.told().map(|(place, _)| place.clone()).collect()
     }
 
-    /// The texts of secrets have come, which were not there before: whoever has them redacted has the right hash, and yet not
-    /// what it needs. They are told with the change that they came with.
+    /// The texts of secrets have come, which were not there before: whoever has them redacted has
+    /// the right hash, and yet not what it needs. They are told with the change that they came
+    /// with.
     pub(super) fn note_texts(&mut self, change: &Change) {
         // What is not changed is looked at only as long as something is missing.
         if self.lacks_texts {
@@ -155,7 +155,11 @@ impl Engine {
     pub(super) fn of_notice(&mut self, notice: &Notice) -> Option<Told> {
         let delivery = self.identity.delivery;
         let text = messages::notice(notice, delivery, now()).inspect_err(|error| {
-            tracing::error!(place = %notice.place, %error, "nobody is told of a configuration that is too large");
+            tracing::error!(
+                place = %notice.place,
+                %error,
+                "nobody is told of a configuration that is too large",
+            );
         });
         let key = match notice.standing() {
             Some(standing) => self.key(&notice.place, &standing),
@@ -177,20 +181,12 @@ impl Engine {
         if !self.tells {
             return None;
         }
-        Some(Told {
-            place: place.to_string(),
-            key: Some(self.key(place, standing)?),
-            notice: None,
-        })
+        Some(Told { place: place.to_string(), key: Some(self.key(place, standing)?), notice: None })
     }
 
     /// That the key is to go, if it is this place's.
     fn without_key(&mut self, place: &Place) -> Option<Told> {
-        Some(Told {
-            place: place.to_string(),
-            key: Some(self.key_to_go(place)?),
-            notice: None,
-        })
+        Some(Told { place: place.to_string(), key: Some(self.key_to_go(place)?), notice: None })
     }
 
     fn key_to_go(&mut self, place: &Place) -> Option<(String, Option<Bytes>)> {
@@ -207,7 +203,8 @@ impl Engine {
             // It had one while its document was there.
             return self.key_to_go(place);
         }
-        let value = messages::state_value(standing, self.identity.delivery, self.freshness()).ok()?;
+        let value =
+            messages::state_value(standing, self.identity.delivery, self.freshness()).ok()?;
         let name = self.key_name(place);
         self.keyed.insert(name.clone(), place.clone());
         Some((name, Some(Bytes::from(value))))

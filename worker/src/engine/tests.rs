@@ -46,7 +46,11 @@ struct Board {
 
 #[async_trait]
 impl Outlet for Board {
-    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
+    async fn deliver(
+        &self,
+        changes: &[KeyChange],
+        messages: &[KeyedMessage],
+    ) -> Result<(), OutletError> {
         if !*self.is_up.borrow() {
             return Err(OutletError::Away("switched off".to_owned()));
         }
@@ -85,9 +89,7 @@ struct Answers(mpsc::Sender<(String, Value)>);
 
 impl Replies for Answers {
     fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String> {
-        self.0
-            .try_send((to.to_string(), parse(&payload)))
-            .map_err(|error| error.to_string())
+        self.0.try_send((to.to_string(), parse(&payload))).map_err(|error| error.to_string())
     }
 
     fn shared(&self) -> Option<ChannelName> {
@@ -125,7 +127,12 @@ fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) ->
     world_as(start, is_leader, copies, Delivery::Text)
 }
 
-fn world_as(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>, delivery: Delivery) -> World {
+fn world_as(
+    start: Option<Loaded>,
+    is_leader: bool,
+    copies: Option<Copies>,
+    delivery: Delivery,
+) -> World {
     world_on(start, is_leader, copies, delivery, None)
 }
 
@@ -151,10 +158,7 @@ fn world_on(
     let (see, seen) = mpsc::channel(64);
     let (acks_out, acks) = watch::channel(None);
     let identity = Identity {
-        site: Site {
-            layer: "edge".parse().unwrap(),
-            node: Some("robot-1".parse().unwrap()),
-        },
+        site: Site { layer: "edge".parse().unwrap(), node: Some("robot-1".parse().unwrap()) },
         node: "robot-1".parse().unwrap(),
         worker_id: "w-1".to_owned(),
         delivery,
@@ -216,11 +220,7 @@ fn documents(rate: u64) -> Vec<Document> {
 
 /// A commit right after the one before.
 fn commit(revision: u64, edit: Edit) -> Incoming {
-    Incoming::Commit {
-        revision,
-        previous: revision - 1,
-        edits: vec![edit],
-    }
+    Incoming::Commit { revision, previous: revision - 1, edits: vec![edit] }
 }
 
 fn put(revision: u64, document: Document) -> Incoming {
@@ -233,10 +233,7 @@ fn remove(revision: u64, document: Document) -> Incoming {
 
 /// Another rate of `slam`.
 fn slam(revision: u64, rate: u64) -> Incoming {
-    put(
-        revision,
-        document("Service/slam", revision, json!({ "config": { "rate_hz": rate } })),
-    )
+    put(revision, document("Service/slam", revision, json!({ "config": { "rate_hz": rate } })))
 }
 
 /// Channels and notices among what was seen.
@@ -249,9 +246,7 @@ fn noticed(seen: &[Seen]) -> impl Iterator<Item = (&str, &Value)> {
 
 /// Rates in notices.
 fn rates(seen: &[Seen]) -> Vec<u64> {
-    noticed(seen)
-        .filter_map(|(_, notice)| notice["config"]["rate_hz"].as_u64())
-        .collect()
+    noticed(seen).filter_map(|(_, notice)| notice["config"]["rate_hz"].as_u64()).collect()
 }
 
 /// What a copy of a store holds.
@@ -279,17 +274,10 @@ fn with_place(instance: &str, loaded: Loaded) -> Loaded {
 
 /// What a mounted file says.
 fn file(rate: u64) -> defaults::Status {
-    let documents = documents(rate).into_iter().map(|document| {
-        Arc::new(Document {
-            revision: 0,
-            ..document
-        })
-    });
+    let documents =
+        documents(rate).into_iter().map(|document| Arc::new(Document { revision: 0, ..document }));
     defaults::Status {
-        current: Some(Arc::new(defaults::Defaults {
-            documents: documents.collect(),
-            left_out: 0,
-        })),
+        current: Some(Arc::new(defaults::Defaults { documents: documents.collect(), left_out: 0 })),
         problem: None,
     }
 }
@@ -310,20 +298,12 @@ impl World {
             resumed: false,
         })
         .await;
-        self.says(Incoming::Snapshot {
-            revision,
-            documents,
-            last: true,
-        })
-        .await;
+        self.says(Incoming::Snapshot { revision, documents, last: true }).await;
         stream
     }
 
     async fn closes(&self) {
-        let closed = SyncEvent::Closed {
-            reason: "cut".to_owned(),
-            is_unreadable: false,
-        };
+        let closed = SyncEvent::Closed { reason: "cut".to_owned(), is_unreadable: false };
         self.sync.send(closed).await.unwrap();
     }
 
@@ -335,10 +315,7 @@ impl World {
 
     async fn hello(&self) -> v1::Hello {
         let (send, hello) = oneshot::channel();
-        let greeting = SyncEvent::Greeting {
-            is_safe: true,
-            answer: send,
-        };
+        let greeting = SyncEvent::Greeting { is_safe: true, answer: send };
         self.sync.send(greeting).await.unwrap();
         hello.await.unwrap()
     }
@@ -352,8 +329,10 @@ impl World {
     }
 
     async fn slam(&mut self) -> Value {
-        self.asks(json!({ "id": "1", "service": "slam", "instance": "0", "reply_to": "blaze/reply/t" }))
-            .await
+        self.asks(
+            json!({ "id": "1", "service": "slam", "instance": "0", "reply_to": "blaze/reply/t" }),
+        )
+        .await
     }
 
     async fn notice(&mut self) -> (String, Value) {
@@ -364,9 +343,7 @@ impl World {
                 }
             }
         };
-        tokio::time::timeout(Duration::from_secs(10), wait)
-            .await
-            .expect("a notice within 10 s")
+        tokio::time::timeout(Duration::from_secs(10), wait).await.expect("a notice within 10 s")
     }
 
     /// Everything that has been told by now, and by then.
@@ -387,21 +364,14 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
     w.opens(documents(30), 2).await;
     w.rest().await;
     let answer = w.slam().await;
-    assert_eq!(
-        (&answer["config"]["rate_hz"], &answer["source"]),
-        (&json!(30), &json!("main"))
-    );
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(30), &json!("main")));
     assert_eq!((&answer["node"], &answer["revision"]), (&json!("robot-1"), &json!(2)));
     w.rest().await;
 
     w.says(slam(3, 10)).await;
     let told = w.rest().await;
     let notices: Vec<_> = noticed(&told).collect();
-    assert_eq!(
-        notices.len(),
-        2,
-        "the instance that asked, and the one without: {told:?}"
-    );
+    assert_eq!(notices.len(), 2, "the instance that asked, and the one without: {told:?}");
     for (channel, notice) in notices {
         assert_eq!(channel, "blaze/config/changed/slam");
         assert_eq!(
@@ -417,11 +387,8 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
     assert_eq!(keys.collect::<Vec<_>>(), ["blaze:config:slam", "blaze:config:slam:0"]);
 
     // A new revision that says the same is told to nobody.
-    let same = document(
-        "Service/slam",
-        4,
-        json!({ "config": { "rate_hz": 10 }, "description": "new" }),
-    );
+    let same =
+        document("Service/slam", 4, json!({ "config": { "rate_hz": 10 }, "description": "new" }));
     w.says(put(4, same)).await;
     assert_eq!(w.rest().await, []);
     assert_eq!(w.slam().await["revision"], 3);
@@ -448,9 +415,7 @@ async fn what_is_missing_is_asked_for_anew_and_services_keep_what_they_have() {
     w.rest().await;
     // The one before is missing.
     w.says(slam(9, 1)).await;
-    tokio::time::timeout(Duration::from_secs(10), stream.cancelled())
-        .await
-        .unwrap();
+    tokio::time::timeout(Duration::from_secs(10), stream.cancelled()).await.unwrap();
     assert_eq!(w.slam().await["config"]["rate_hz"], 30);
     w.closes().await;
     let hello = w.hello().await;
@@ -472,10 +437,7 @@ async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
     w.defaults.send_replace(file(1));
     w.rest().await;
     let answer = w.slam().await;
-    assert_eq!(
-        (&answer["config"]["rate_hz"], &answer["source"]),
-        (&json!(1), &json!("file"))
-    );
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(1), &json!("file")));
     w.defaults.send_replace(file(2));
     w.rest().await;
     assert_eq!(w.slam().await["config"]["rate_hz"], 2);
@@ -485,10 +447,7 @@ async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
     w.rest().await;
     w.closes().await;
     let answer = w.slam().await;
-    assert_eq!(
-        (&answer["config"]["rate_hz"], &answer["source"]),
-        (&json!(30), &json!("copy"))
-    );
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(30), &json!("copy")));
 }
 
 #[tokio::test(start_paused = true)]
@@ -496,14 +455,12 @@ async fn a_new_life_serves_what_the_last_one_had_and_tells_only_what_differs() {
     let loaded = with_place("0", copy_of("s", 2, documents(30)));
     let mut w = world_from(Some(loaded), true);
     let answer = w.slam().await;
-    assert_eq!(
-        (&answer["config"]["rate_hz"], &answer["source"]),
-        (&json!(30), &json!("copy"))
-    );
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(30), &json!("copy")));
     assert_eq!(answer["as_of"], "1970-01-01T00:00:01.000Z");
     let hello = w.hello().await;
     assert_eq!((hello.revision, hello.store_id.as_str()), (2, "s"));
-    let of_slam_0 = |seen: &Seen| matches!(seen, Seen::Notice(_, notice) if notice["instance"] == "0");
+    let of_slam_0 =
+        |seen: &Seen| matches!(seen, Seen::Notice(_, notice) if notice["instance"] == "0");
     assert!(!w.rest().await.iter().any(of_slam_0), "it was told already");
     w.opens(documents(10), 5).await;
     let told = w.rest().await;

@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 
 use super::{Held, Lease, Mark};
 
-/// Time that the lease is asked for: whoever has it must ask again within it, and an answer may take long.
+/// Time that the lease is asked for: whoever has it must ask again within it, and an answer may
+/// take long.
 pub const TIME: Duration = Duration::from_secs(3);
 /// What an answer may take on a machine that does much else.
 pub const BUSY: Duration = Duration::from_secs(2);
@@ -16,14 +17,18 @@ struct Fixture<'f> {
     first_within: Duration,
 }
 
-/// Runs the whole suite. `lease`: the one of a layer for an owner; no owner is asked for twice. `first_within`: how long the
-/// first may have to wait for one that nobody has had.
+/// Runs the whole suite. `lease`: the one of a layer for an owner; no owner is asked for twice.
+/// `first_within`: how long the first may have to wait for one that nobody has had.
 ///
 /// # Errors
 /// The first rule that does not hold, for people.
-pub async fn run_all(lease: &dyn Fn(&str, &str) -> Arc<dyn Lease>, first_within: Duration) -> Result<(), String> {
+pub async fn run_all(
+    lease: &dyn Fn(&str, &str) -> Arc<dyn Lease>,
+    first_within: Duration,
+) -> Result<(), String> {
     let fixture = &Fixture { lease, first_within };
-    let named = |rule: &str, result: Result<(), String>| result.map_err(|error| format!("{rule}: {error}"));
+    let named =
+        |rule: &str, result: Result<(), String>| result.map_err(|error| format!("{rule}: {error}"));
     named("one at a time", one_at_a_time(fixture).await)?;
     named("marks", marks(fixture).await)?;
     named("what is given up", what_is_given_up(fixture).await)?;
@@ -53,8 +58,8 @@ async fn take(lease: &dyn Lease, within: Duration) -> Result<(Held, Duration), S
     }
 }
 
-/// Asks again as who has it. Where nobody knows for a moment, because a server is busy, it is asked for again as long
-/// as it is had.
+/// Asks again as who has it. Where nobody knows for a moment, because a server is busy, it is asked
+/// for again as long as it is had.
 async fn renew(lease: &dyn Lease, told: Option<&Mark>) -> Result<Held, String> {
     let start = Instant::now();
     loop {
@@ -66,13 +71,11 @@ async fn renew(lease: &dyn Lease, told: Option<&Mark>) -> Result<Held, String> {
 }
 
 fn mark(revision: u64) -> Mark {
-    Mark {
-        store_id: "0197c1d2-7f3a".to_owned(),
-        revision,
-    }
+    Mark { store_id: "0197c1d2-7f3a".to_owned(), revision }
 }
 
-/// Of two that ask one has it, and goes on having it for as long as it asks; those of two layers are two.
+/// Of two that ask one has it, and goes on having it for as long as it asks; those of two layers
+/// are two.
 async fn one_at_a_time(fixture: &Fixture<'_>) -> Result<(), String> {
     let (one, other) = ((fixture.lease)("a", "one"), (fixture.lease)("a", "other"));
     take(&*one, fixture.first_within).await?;
@@ -92,16 +95,14 @@ async fn one_at_a_time(fixture: &Fixture<'_>) -> Result<(), String> {
     Ok(())
 }
 
-/// Who has it leaves a mark, which the others see and who takes it gets; who does not have it leaves none.
+/// Who has it leaves a mark, which the others see and who takes it gets; who does not have it
+/// leaves none.
 async fn marks(fixture: &Fixture<'_>) -> Result<(), String> {
     let (one, other) = ((fixture.lease)("marks", "one"), (fixture.lease)("marks", "other"));
     let (held, _) = take(&*one, fixture.first_within).await?;
     check(held.told.is_none(), "there was a mark before anybody left one")?;
     let held = renew(&*one, Some(&mark(7))).await?;
-    check(
-        held.told == Some(mark(7)),
-        format!("left was 7, found is {:?}", held.told),
-    )?;
+    check(held.told == Some(mark(7)), format!("left was 7, found is {:?}", held.told))?;
     let held = renew(&*one, None).await?;
     check(held.told == Some(mark(7)), "a call without a mark takes it away")?;
     let start = Instant::now();
@@ -109,10 +110,7 @@ async fn marks(fixture: &Fixture<'_>) -> Result<(), String> {
         let seen = other.hold(TIME, Some(&mark(99))).await.unwrap_or_default();
         check(!seen.is_held, "two have it")?;
         let held = renew(&*one, Some(&mark(8))).await?;
-        check(
-            held.told == Some(mark(8)),
-            format!("left was 8, found is {:?}", held.told),
-        )?;
+        check(held.told == Some(mark(8)), format!("left was 8, found is {:?}", held.told))?;
         if seen.told == Some(mark(8)) {
             break;
         }
@@ -139,15 +137,9 @@ async fn marks(fixture: &Fixture<'_>) -> Result<(), String> {
         tokio::time::sleep(TIME / 50).await;
     }
     let late = one.hold(TIME, Some(&mark(9))).await.unwrap_or_default();
-    check(
-        !late.is_held && late.told != Some(mark(9)),
-        "who gave it up leaves a mark",
-    )?;
+    check(!late.is_held && late.told != Some(mark(9)), "who gave it up leaves a mark")?;
     let held = renew(&*other, Some(&mark(10))).await?;
-    check(
-        held.is_held && held.told == Some(mark(10)),
-        format!("left was 10, found is {held:?}"),
-    )?;
+    check(held.is_held && held.told == Some(mark(10)), format!("left was 10, found is {held:?}"))?;
     other.release().await;
     Ok(())
 }
@@ -192,13 +184,13 @@ async fn what_runs_out(fixture: &Fixture<'_>) -> Result<(), String> {
 
 /// Of many that ask for one that nobody has ever had, one has it.
 async fn many_at_once(fixture: &Fixture<'_>) -> Result<(), String> {
-    let leases: Vec<_> = (0..6)
-        .map(|number| (fixture.lease)("many", &format!("w{number}")))
-        .collect();
+    let leases: Vec<_> =
+        (0..6).map(|number| (fixture.lease)("many", &format!("w{number}"))).collect();
     let (start, mut winner) = (Instant::now(), None);
     while start.elapsed() < fixture.first_within + TIME {
         let asked = Instant::now();
-        let answers = futures::future::join_all(leases.iter().map(|lease| lease.hold(TIME, None))).await;
+        let answers =
+            futures::future::join_all(leases.iter().map(|lease| lease.hold(TIME, None))).await;
         let have: Vec<usize> = answers
             .iter()
             .enumerate()
@@ -208,10 +200,7 @@ async fn many_at_once(fixture: &Fixture<'_>) -> Result<(), String> {
         check(have.len() <= 1, format!("{have:?} have it"))?;
         if let Some(number) = have.first() {
             let was = *winner.get_or_insert(*number);
-            check(
-                was == *number,
-                format!("{was} has lost it to {number}, and asked in time"),
-            )?;
+            check(was == *number, format!("{was} has lost it to {number}, and asked in time"))?;
         }
         tokio::time::sleep((TIME / 10).saturating_sub(asked.elapsed())).await;
     }

@@ -13,28 +13,23 @@ use super::{Held, Lease, Mark};
 /// The topic of the leases of all layers.
 const TOPIC: &str = "blaze/worker/lease";
 
-/// The lease of a layer: membership of the group `blaze-worker-<layer>`, with the mark beside the committed offset.
+/// The lease of a layer: membership of the group `blaze-worker-<layer>`, with the mark beside the
+/// committed offset.
 pub struct KafkaLease {
     group: String,
     lease: GroupLease,
 }
 
 impl KafkaLease {
-    /// The lease of a layer, for a worker that holds it for `time` at a time. Begins to connect in the background.
+    /// The lease of a layer, for a worker that holds it for `time` at a time. Begins to connect in
+    /// the background.
     ///
     /// # Errors
     /// [`OpenError`] for a section that can never work.
     pub fn open(section: &Section, layer: &LayerName, time: Duration) -> Result<Self, OpenError> {
         let group = format!("blaze-worker-{layer}");
-        let options = GroupLeaseOptions {
-            channel: TOPIC,
-            group: group.clone(),
-            time,
-        };
-        Ok(Self {
-            group,
-            lease: GroupLease::open(section, options)?,
-        })
+        let options = GroupLeaseOptions { channel: TOPIC, group: group.clone(), time };
+        Ok(Self { group, lease: GroupLease::open(section, options)? })
     }
 }
 
@@ -44,10 +39,7 @@ impl Lease for KafkaLease {
     async fn hold(&self, _time: Duration, told: Option<&Mark>) -> Result<Held, String> {
         let text = told.map(Mark::to_text);
         let held = self.lease.hold(text.as_deref()).await?;
-        Ok(Held {
-            is_held: held.is_held,
-            told: held.note.as_deref().and_then(Mark::parse),
-        })
+        Ok(Held { is_held: held.is_held, told: held.note.as_deref().and_then(Mark::parse) })
     }
 
     async fn release(&self) {

@@ -12,7 +12,8 @@ pub struct Mark {
 }
 
 impl Mark {
-    /// Whether whatever follows from `other` follows from this, too. Of two stores neither says anything about the other.
+    /// Whether whatever follows from `other` follows from this, too. Of two stores neither says
+    /// anything about the other.
     #[must_use]
     pub fn covers(&self, other: &Self) -> bool {
         self.store_id == other.store_id && self.revision >= other.revision
@@ -36,10 +37,7 @@ mod tests {
     use super::*;
 
     fn mark(store: &str, revision: u64) -> Mark {
-        Mark {
-            store_id: store.to_owned(),
-            revision,
-        }
+        Mark { store_id: store.to_owned(), revision }
     }
 
     #[test]
@@ -52,13 +50,8 @@ mod tests {
     fn it_is_read_as_it_was_written_and_anything_else_is_no_mark() {
         let one = mark("0197-\"x\"", u64::MAX);
         assert_eq!(Mark::parse(&one.to_text()), Some(one));
-        for text in [
-            "",
-            "7",
-            "{}",
-            "{\"store_id\":\"a\"}",
-            "{\"store_id\":\"a\",\"revision\":-1}",
-        ] {
+        for text in ["", "7", "{}", "{\"store_id\":\"a\"}", "{\"store_id\":\"a\",\"revision\":-1}"]
+        {
             assert_eq!(Mark::parse(text), None, "{text}");
         }
     }

@@ -6,8 +6,9 @@
 //!                               ─ ? ───▶ as before, until that time is over
 //! ```
 //!
-//! It lies in the layer's MongoDB ([`MongoLease`]), else in Redis ([`RedisLease`]), else it is membership of a
-//! consumer group on the layer's Kafka ([`KafkaLease`]). Beside it lies how far services were told ([`Mark`]): whoever takes over tells the rest.
+//! It lies in the layer's MongoDB ([`MongoLease`]), else in Redis ([`RedisLease`]), else it is
+//! membership of a consumer group on the layer's Kafka ([`KafkaLease`]). Beside it lies how far
+//! services were told ([`Mark`]): whoever takes over tells the rest.
 
 #[cfg(feature = "conformance")]
 pub mod conformance;
@@ -48,8 +49,8 @@ pub struct Held {
 /// Where the lease lies.
 #[async_trait]
 pub trait Lease: Send + Sync + 'static {
-    /// Takes it if nobody has it, or goes on having it, for so long from now. Whoever had it before leaves `told` beside it;
-    /// whoever takes it does not, and gets what the one before has left.
+    /// Takes it if nobody has it, or goes on having it, for so long from now. Whoever had it before
+    /// leaves `told` beside it; whoever takes it does not, and gets what the one before has left.
     ///
     /// # Errors
     /// For people: nobody knows.
@@ -67,11 +68,12 @@ pub trait Lease: Send + Sync + 'static {
     fn describe(&self) -> String;
 }
 
-/// Holds it as long as it can, for ever, and says whether it has it. Whoever cancels this gives it up with
-/// [`Lease::release`].
+/// Holds it as long as it can, for ever, and says whether it has it. Whoever cancels this gives it
+/// up with [`Lease::release`].
 pub async fn keep(lease: Arc<dyn Lease>, time: Duration, holder: &mut Holder) {
     let mut until: Option<Instant> = None;
-    // Whoever waits looks often, and what is held is a little shorter, so that together they are no longer than the lease.
+    // Whoever waits looks often, and what is held is a little shorter, so that together they are no
+    // longer than the lease.
     let (held, renew, look) = (time * 9 / 10, time / 3, time / 20);
     loop {
         // The lease counts from before it was asked for: the server began later.

@@ -1,9 +1,11 @@
-//! The lease as a document of MongoDB, standalone or replica set: `leases`, one document for each layer.
+//! The lease as a document of MongoDB, standalone or replica set: `leases`, one document for each
+//! layer.
 //!
-//! Taking and renewing are one update of that document, which MongoDB does wholly or not at all. Until when it is held is
-//! reckoned by the server alone (`$$NOW`), so the clocks of the workers do not matter. It counts once a majority of the
-//! members has it: a primary that was replaced and does not know it yet gives no lease. A new primary reckons with its own
-//! clock: as far as the clocks of the members differ, the lease is shorter or longer then.
+//! Taking and renewing are one update of that document, which MongoDB does wholly or not at all.
+//! Until when it is held is reckoned by the server alone (`$$NOW`), so the clocks of the workers do
+//! not matter. It counts once a majority of the members has it: a primary that was replaced and
+//! does not know it yet gives no lease. A new primary reckons with its own clock: as far as the
+//! clocks of the members differ, the lease is shorter or longer then.
 
 use std::time::Duration;
 
@@ -30,14 +32,14 @@ impl MongoLease {
     ///
     /// # Errors
     /// [`CopyError::Refused`] for a name that no database can have.
-    pub fn new(uri: SecretText, database: &str, layer: LayerName, owner: String) -> Result<Self, CopyError> {
+    pub fn new(
+        uri: SecretText,
+        database: &str,
+        layer: LayerName,
+        owner: String,
+    ) -> Result<Self, CopyError> {
         let place = format!("MongoDB {database}, lease {layer}");
-        Ok(Self {
-            server: Server::new(uri, database, "lease", &place)?,
-            place,
-            layer,
-            owner,
-        })
+        Ok(Self { server: Server::new(uri, database, "lease", &place)?, place, layer, owner })
     }
 }
 
@@ -81,8 +83,9 @@ impl Lease for MongoLease {
     }
 }
 
-/// What becomes of the document: it is this owner's from now on if it was or if nobody has it, else it stays. Only who had it
-/// before leaves a mark: whoever takes it is to see that of the one before.
+/// What becomes of the document: it is this owner's from now on if it was or if nobody has it, else
+/// it stays. Only who had it before leaves a mark: whoever takes it is to see that of the one
+/// before.
 fn taken(owner: &str, time: Duration, told: Option<&Mark>) -> Document {
     let time_ms = i64::try_from(time.as_millis()).unwrap_or(i64::MAX).max(1);
     let owner = doc! { "$literal": owner };

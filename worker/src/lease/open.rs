@@ -11,8 +11,9 @@ use blaze_domain::node_file::{DatabaseSection, KafkaBroker, LayerBroker, SecretT
 use super::{Lease, RedisLease};
 use crate::settings::{LocalBroker, WorkerSettings};
 
-/// The lease of the worker's layer: in its MongoDB, else in Redis, else on its Kafka. `None`: on the broker of a node there is
-/// one worker; on that of a layer without any of these it must be alone.
+/// The lease of the worker's layer: in its MongoDB, else in Redis, else on its Kafka. `None`: on
+/// the broker of a node there is one worker; on that of a layer without any of these it must be
+/// alone.
 ///
 /// # Errors
 /// A section that can never work, or that this program was not built for.
@@ -29,7 +30,9 @@ pub fn open(
         (Some(DatabaseSection::MongoDb { uri, database }), _, _) => {
             mongodb(uri, database, layer, worker_id).context("database.mongodb")?
         }
-        (_, Some(keys), _) => Arc::new(RedisLease::new(Arc::clone(keys), layer, worker_id.to_owned())),
+        (_, Some(keys), _) => {
+            Arc::new(RedisLease::new(Arc::clone(keys), layer, worker_id.to_owned()))
+        }
         (_, None, LayerBroker::Kafka(section)) => {
             // As long as it is held, see `keep`: the rest is for the others to hear of it.
             kafka(section, layer, settings.lease * 9 / 10).context("brokers.layer.kafka")?
@@ -44,22 +47,40 @@ pub fn open(
 }
 
 #[cfg(feature = "mongodb")]
-fn mongodb(uri: &SecretText, database: &str, layer: &LayerName, owner: &str) -> anyhow::Result<Arc<dyn Lease>> {
+fn mongodb(
+    uri: &SecretText,
+    database: &str,
+    layer: &LayerName,
+    owner: &str,
+) -> anyhow::Result<Arc<dyn Lease>> {
     let lease = super::MongoLease::new(uri.clone(), database, layer.clone(), owner.to_owned())?;
     Ok(Arc::new(lease))
 }
 
 #[cfg(not(feature = "mongodb"))]
-fn mongodb(_uri: &SecretText, _database: &str, _layer: &LayerName, _owner: &str) -> anyhow::Result<Arc<dyn Lease>> {
+fn mongodb(
+    _uri: &SecretText,
+    _database: &str,
+    _layer: &LayerName,
+    _owner: &str,
+) -> anyhow::Result<Arc<dyn Lease>> {
     anyhow::bail!("this program was built without MongoDB (cargo feature `mongodb`)")
 }
 
 #[cfg(feature = "kafka")]
-fn kafka(section: &KafkaBroker, layer: &LayerName, time: Duration) -> anyhow::Result<Arc<dyn Lease>> {
+fn kafka(
+    section: &KafkaBroker,
+    layer: &LayerName,
+    time: Duration,
+) -> anyhow::Result<Arc<dyn Lease>> {
     Ok(Arc::new(super::KafkaLease::open(section, layer, time)?))
 }
 
 #[cfg(not(feature = "kafka"))]
-fn kafka(_section: &KafkaBroker, _layer: &LayerName, _time: Duration) -> anyhow::Result<Arc<dyn Lease>> {
+fn kafka(
+    _section: &KafkaBroker,
+    _layer: &LayerName,
+    _time: Duration,
+) -> anyhow::Result<Arc<dyn Lease>> {
     anyhow::bail!("this program was built without Kafka (cargo feature `kafka`)")
 }

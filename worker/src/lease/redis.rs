@@ -21,10 +21,7 @@ impl RedisLease {
     #[must_use]
     pub fn new(keys: Arc<RedisKeys>, layer: &LayerName, owner: String) -> Self {
         let key = lease_key(layer);
-        Self {
-            keys,
-            lock: RedisLock { key, owner },
-        }
+        Self { keys, lock: RedisLock { key, owner } }
     }
 }
 
@@ -34,10 +31,7 @@ impl Lease for RedisLease {
         let text = told.map(Mark::to_text);
         let held = self.keys.hold(&self.lock, time, text.as_deref()).await;
         let held = held.map_err(|error| error.to_string())?;
-        Ok(Held {
-            is_held: held.is_held,
-            told: held.note.as_deref().and_then(Mark::parse),
-        })
+        Ok(Held { is_held: held.is_held, told: held.note.as_deref().and_then(Mark::parse) })
     }
 
     async fn release(&self) {

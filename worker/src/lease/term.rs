@@ -13,8 +13,9 @@ use tokio::time::Instant;
 
 use super::Mark;
 
-/// Until when this worker leads. Clones share it. Whoever acts for the layer looks at it immediately before: a process that
-/// was stopped and goes on has not yet heard of anything that happened meanwhile.
+/// Until when this worker leads. Clones share it. Whoever acts for the layer looks at it
+/// immediately before: a process that was stopped and goes on has not yet heard of anything that
+/// happened meanwhile.
 #[derive(Debug, Clone)]
 pub struct Term(Arc<Mutex<Until>>);
 
@@ -65,8 +66,8 @@ pub struct Holder {
 
 /// What the rest of the worker knows of the lease.
 pub struct Leadership {
-    /// The number of the term in which it leads; `None`: it does not. Two terms have different numbers, also if nobody
-    /// looked in between.
+    /// The number of the term in which it leads; `None`: it does not. Two terms have different
+    /// numbers, also if nobody looked in between.
     pub leader: watch::Receiver<Option<u64>>,
     /// Until when.
     pub term: Term,
@@ -83,19 +84,8 @@ pub fn leadership() -> (Holder, Leadership) {
     let (noted, notes) = watch::channel(None);
     let (tell, told) = watch::channel(None);
     let term = Term::over();
-    let holder = Holder {
-        leader,
-        term: term.clone(),
-        noted,
-        told,
-        terms: 0,
-    };
-    let leadership = Leadership {
-        leader: led,
-        term,
-        noted: notes,
-        told: tell,
-    };
+    let holder = Holder { leader, term: term.clone(), noted, told, terms: 0 };
+    let leadership = Leadership { leader: led, term, noted: notes, told: tell };
     (holder, leadership)
 }
 

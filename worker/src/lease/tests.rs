@@ -58,10 +58,7 @@ struct Worker {
 impl Worker {
     fn start(server: &Arc<Server>, owner: &str) -> Self {
         let (mut holder, leadership) = leadership();
-        let lease = Arc::new(OnServer {
-            server: Arc::clone(server),
-            owner: owner.to_owned(),
-        });
+        let lease = Arc::new(OnServer { server: Arc::clone(server), owner: owner.to_owned() });
         let mut tasks = JoinSet::new();
         tasks.spawn(async move { keep(lease, TIME, &mut holder).await });
         Self { leadership, tasks }
@@ -78,10 +75,7 @@ impl Worker {
 }
 
 fn mark(revision: u64) -> Mark {
-    Mark {
-        store_id: "s".to_owned(),
-        revision,
-    }
+    Mark { store_id: "s".to_owned(), revision }
 }
 
 #[tokio::test(start_paused = true)]
@@ -121,10 +115,7 @@ async fn the_mark_of_who_leads_is_there_before_the_next_one_does() {
     let mut other = Worker::start(&server, "other");
     other.leadership.told.send_replace(Some(mark(99)));
     let wait = other.leadership.noted.wait_for(|noted| *noted == Some(mark(7)));
-    tokio::time::timeout(TIME, wait)
-        .await
-        .expect("who waits sees it")
-        .unwrap();
+    tokio::time::timeout(TIME, wait).await.expect("who waits sees it").unwrap();
     one.leadership.told.send_replace(Some(mark(8)));
     tokio::time::sleep(TIME).await;
     drop(one.tasks);
@@ -162,13 +153,14 @@ async fn a_term_is_over_by_itself() {
 async fn what_is_given_up_is_had_at_once() {
     let server = Arc::new(Server::default());
     let (mut holder, leadership) = leadership();
-    let lease = Arc::new(OnServer {
-        server: Arc::clone(&server),
-        owner: "one".to_owned(),
-    });
+    let lease = Arc::new(OnServer { server: Arc::clone(&server), owner: "one".to_owned() });
     let mut leader = leadership.leader.clone();
     tokio::select! {
-        () = keep(Arc::clone(&lease) as Arc<dyn Lease>, TIME, &mut holder) => unreachable!("for ever"),
+        () = keep(
+            Arc::clone(&lease) as Arc<dyn Lease>,
+            TIME,
+            &mut holder,
+        ) => unreachable!("for ever"),
         led = leader.wait_for(Option::is_some) => assert!(led.is_ok()),
     }
     let mut other = Worker::start(&server, "other");

@@ -1,7 +1,7 @@
 //! Where keys and notices go: a broker, and a Redis for the keys where there is one.
 //!
-//! A notice counts as told when the server has it where the broker can tell (Redis that is the broker's own, Kafka), else when
-//! the broker's client has taken it.
+//! A notice counts as told when the server has it where the broker can tell (Redis that is the
+//! broker's own, Kafka), else when the broker's client has taken it.
 
 use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
@@ -10,8 +10,8 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use blaze_brokers::redis::{KeyChange, KeyError, RedisKeys, RedisLock};
 use blaze_brokers::{
-    Broker, BrokerError, BrokerKind, Health, KeyedMessage, PublishOutcome, Publisher, PublisherOptions, WorkerSide,
-    WriteError,
+    Broker, BrokerError, BrokerKind, Health, KeyedMessage, PublishOutcome, Publisher,
+    PublisherOptions, WorkerSide, WriteError,
 };
 use blaze_domain::ServiceName;
 use blaze_domain::names::ChannelName;
@@ -31,7 +31,8 @@ pub enum OutletError {
     /// The broker does not answer.
     #[error("the broker is away: {0}")]
     Away(String),
-    /// The broker has these channels not yet; it may have others. The keys were changed, no message was published.
+    /// The broker has these channels not yet; it may have others. The keys were changed, no message
+    /// was published.
     #[error("{} channels are not there yet: {reason}", channels.len())]
     NotYet {
         /// Where it was to go.
@@ -39,7 +40,8 @@ pub enum OutletError {
         /// What one of them waits for.
         reason: String,
     },
-    /// Nothing was done: the server of the keys, which is another one than the broker, does not take them.
+    /// Nothing was done: the server of the keys, which is another one than the broker, does not
+    /// take them.
     #[error("the keys are not written: {0}")]
     KeysAlone(KeyError),
     /// It is more than the broker carries.
@@ -67,7 +69,9 @@ impl OutletError {
             Self::TooLarge { .. } | Self::Keys(KeyError::Refused { .. }) => true,
             Self::Broker(error) => match error {
                 BrokerError::Name { .. } | BrokerError::Collision { .. } => true,
-                BrokerError::Closed | BrokerError::Away(_) | BrokerError::TooManyChannels(_) => false,
+                BrokerError::Closed | BrokerError::Away(_) | BrokerError::TooManyChannels(_) => {
+                    false
+                }
             },
             Self::Away(_)
             | Self::NotYet { .. }
@@ -91,12 +95,17 @@ impl From<WriteError> for OutletError {
 /// Where keys and notices go.
 #[async_trait]
 pub trait Outlet: Send + Sync + 'static {
-    /// Makes all changes of keys, then publishes all messages, in their order. Where a server that is not the broker's does not take
-    /// the keys, nothing is published, so that whoever calls can see that it is still its turn and publish without them.
+    /// Makes all changes of keys, then publishes all messages, in their order. Where a server that
+    /// is not the broker's does not take the keys, nothing is published, so that whoever calls can
+    /// see that it is still its turn and publish without them.
     ///
     /// # Errors
     /// [`OutletError`]: some of it may have been done; doing all of it again does no harm.
-    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError>;
+    async fn deliver(
+        &self,
+        changes: &[KeyChange],
+        messages: &[KeyedMessage],
+    ) -> Result<(), OutletError>;
 
     /// Whether keys are kept at all.
     fn has_keys(&self) -> bool;
@@ -117,7 +126,8 @@ pub trait Channels: Send + Sync + 'static {
     fn serve(&self, services: BTreeSet<ServiceName>);
 }
 
-/// The channel on which a service is told; `None` never happens, as a name of a service is part of a good one.
+/// The channel on which a service is told; `None` never happens, as a name of a service is part of
+/// a good one.
 #[must_use]
 pub fn changed(service: &ServiceName) -> Option<ChannelName> {
     format!("blaze/config/changed/{service}").parse().ok()
@@ -142,12 +152,17 @@ struct Keys {
     client: Arc<RedisKeys>,
     /// It is the broker's own server: keys and notices go in one transaction.
     is_broker: bool,
-    /// The lease, where it lies on the same server: the server changes nothing for whoever has not got it.
+    /// The lease, where it lies on the same server: the server changes nothing for whoever has not
+    /// got it.
     lock: Option<RedisLock>,
 }
 
 impl Keys {
-    async fn apply(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+    async fn apply(
+        &self,
+        changes: &[KeyChange],
+        messages: &[(ChannelName, Bytes)],
+    ) -> Result<(), OutletError> {
         match &self.lock {
             None => Ok(self.client.apply(changes, messages).await?),
             Some(lock) => match self.client.apply_if_held(lock, changes, messages).await? {
@@ -172,9 +187,9 @@ impl BrokerOutlet {
         }
     }
 
-    /// The same with keys on a Redis; `is_broker`: it is the broker's own server; `lock`: the lease of one of several workers,
-    /// where it lies there as well; `is_own`: whether a value is one that a
-    /// worker of this place writes, which others on the same server are not to lose.
+    /// The same with keys on a Redis; `is_broker`: it is the broker's own server; `lock`: the lease
+    /// of one of several workers, where it lies there as well; `is_own`: whether a value is one
+    /// that a worker of this place writes, which others on the same server are not to lose.
     #[must_use]
     pub fn with_keys(
         mut self,
@@ -183,11 +198,7 @@ impl BrokerOutlet {
         lock: Option<RedisLock>,
         is_own: impl Fn(&[u8]) -> bool + Send + Sync + 'static,
     ) -> Self {
-        self.keys = Some(Keys {
-            client,
-            is_broker,
-            lock,
-        });
+        self.keys = Some(Keys { client, is_broker, lock });
         self.is_own = Box::new(is_own);
         self
     }
@@ -204,7 +215,8 @@ impl BrokerOutlet {
         self.side.is_some()
     }
 
-    /// Publishes one message, now. What a broker that is away does not take is dropped: whoever asked asks again.
+    /// Publishes one message, now. What a broker that is away does not take is dropped: whoever
+    /// asked asks again.
     ///
     /// # Errors
     /// [`OutletError`].
@@ -212,7 +224,9 @@ impl BrokerOutlet {
         let publisher = self.publisher(channel)?;
         match publisher.publish_bare(payload, None) {
             PublishOutcome::Taken => Ok(()),
-            PublishOutcome::Dropped => Err(OutletError::Away(self.broker.status().borrow().detail.clone())),
+            PublishOutcome::Dropped => {
+                Err(OutletError::Away(self.broker.status().borrow().detail.clone()))
+            }
             PublishOutcome::TooLarge => Err(OutletError::TooLarge { bytes: payload.len() }),
         }
     }
@@ -221,10 +235,7 @@ impl BrokerOutlet {
         if let Some(known) = self.publishers.lock().get(channel) {
             return Ok(Arc::clone(known));
         }
-        let options = PublisherOptions {
-            reliable: true,
-            ..PublisherOptions::default()
-        };
+        let options = PublisherOptions { reliable: true, ..PublisherOptions::default() };
         let made = self.broker.publisher(channel, options)?;
         self.publishers.lock().put(channel.clone(), Arc::clone(&made));
         Ok(made)
@@ -244,10 +255,15 @@ impl BrokerOutlet {
 
 #[async_trait]
 impl Outlet for BrokerOutlet {
-    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
+    async fn deliver(
+        &self,
+        changes: &[KeyChange],
+        messages: &[KeyedMessage],
+    ) -> Result<(), OutletError> {
         match &self.keys {
             Some(keys) if keys.is_broker => {
-                let messages: Vec<_> = said(messages).map(|(to, text)| (to.clone(), text.clone())).collect();
+                let messages: Vec<_> =
+                    said(messages).map(|(to, text)| (to.clone(), text.clone())).collect();
                 return keys.apply(changes, &messages).await;
             }
             Some(keys) => keys.apply(changes, &[]).await.map_err(|error| match error {
@@ -287,9 +303,7 @@ impl Outlet for BrokerOutlet {
 
 /// What is said: where nothing is kept, nothing is taken away.
 fn said(messages: &[KeyedMessage]) -> impl Iterator<Item = (&ChannelName, &Bytes)> {
-    messages
-        .iter()
-        .filter_map(|message| Some((&message.channel, message.value.as_ref()?)))
+    messages.iter().filter_map(|message| Some((&message.channel, message.value.as_ref()?)))
 }
 
 impl Channels for BrokerOutlet {
@@ -314,7 +328,11 @@ impl Channels for BrokerOutlet {
                 }
                 // It is tried again when services come or go.
                 Err(error) => {
-                    tracing::error!(%error, %service, "it cannot be told of changes; it is answered when it asks");
+                    tracing::error!(
+                        %error,
+                        %service,
+                        "it cannot be told of changes; it is answered when it asks",
+                    );
                 }
             }
         }

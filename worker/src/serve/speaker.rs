@@ -1,5 +1,6 @@
-//! Tells services what has changed, one after the other, and never twice what is old already: of what waits, only the newest
-//! of each place counts. A broker that is away holds up nobody; what waits then is bounded by the places that there are.
+//! Tells services what has changed, one after the other, and never twice what is old already: of
+//! what waits, only the newest of each place counts. A broker that is away holds up nobody; what
+//! waits then is bounded by the places that there are.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,11 +20,12 @@ use crate::lease::{Mark, Term};
 const BATCH: usize = 256;
 /// Upper bounds of the pause after a failure, which doubles; full jitter.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
-/// What is for a channel that is not there yet is set aside for so long, so that it does not hold up the rest.
+/// What is for a channel that is not there yet is set aside for so long, so that it does not hold
+/// up the rest.
 const ASIDE: Duration = Duration::from_millis(200);
 
-/// A server of the keys that is not the broker's and does not answer is left alone for so long, which doubles: notices go on
-/// meanwhile.
+/// A server of the keys that is not the broker's and does not answer is left alone for so long,
+/// which doubles: notices go on meanwhile.
 const KEYS_AGAIN: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
 /// Between two tries to look for keys of before.
 const SWEEP_AGAIN: Duration = Duration::from_secs(5);
@@ -33,7 +35,8 @@ const SWEEP_AGAIN: Duration = Duration::from_secs(5);
 pub struct Told {
     /// Which place: a name that no other has.
     pub place: String,
-    /// Its key and what it has from now on, `None`: there is none; absent where the place has no key.
+    /// Its key and what it has from now on, `None`: there is none; absent where the place has no
+    /// key.
     pub key: Option<(String, Option<Bytes>)>,
     /// The notice, if there is one.
     pub notice: Option<KeyedMessage>,
@@ -70,13 +73,7 @@ impl Speaker {
     /// One that tells nothing outside of a term.
     #[must_use]
     pub fn new(term: Term) -> Self {
-        Self {
-            term,
-            shared: Arc::new(Shared {
-                state: Mutex::default(),
-                more: Notify::new(),
-            }),
-        }
+        Self { term, shared: Arc::new(Shared { state: Mutex::default(), more: Notify::new() }) }
     }
 
     /// Tells it as soon as the broker takes it. Never waits.
@@ -105,7 +102,8 @@ impl Speaker {
         self.shared.state.lock().waits_since(store_id, aside)
     }
 
-    /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted must have been told.
+    /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted
+    /// must have been told.
     pub fn sweep_keys(&self) {
         self.shared.state.lock().sweep = true;
         self.shared.more.notify_one();
@@ -120,10 +118,7 @@ impl Speaker {
     #[must_use]
     pub fn counts(&self) -> SpeakerCounts {
         let state = self.shared.state.lock();
-        SpeakerCounts {
-            waiting: state.waiting.len() as u64,
-            ..state.counts
-        }
+        SpeakerCounts { waiting: state.waiting.len() as u64, ..state.counts }
     }
 
     /// Tells what waits, for ever.
@@ -188,11 +183,8 @@ impl Speaker {
                 }
                 continue;
             }
-            let messages: Vec<_> = batch
-                .waiting
-                .iter()
-                .map(|(_, waiting)| waiting.notice.clone())
-                .collect();
+            let messages: Vec<_> =
+                batch.waiting.iter().map(|(_, waiting)| waiting.notice.clone()).collect();
             // At the last instant: what was taken may be old if the process was stopped since.
             let delivered = match self.term.is_on() {
                 true => outlet.deliver(&changes, &messages).await,
@@ -210,7 +202,10 @@ impl Speaker {
                 }
                 Err(OutletError::KeysAlone(error @ KeyError::Away { .. })) => {
                     if keys_pause == KEYS_AGAIN.0 {
-                        tracing::warn!(%error, "keys are not written, notices go on; it is tried again");
+                        tracing::warn!(
+                            %error,
+                            "keys are not written, notices go on; it is tried again",
+                        );
                     }
                     keys_again = Some(Instant::now() + keys_pause);
                     keys_pause = (keys_pause * 2).min(KEYS_AGAIN.1);
@@ -225,21 +220,36 @@ impl Speaker {
                         most = 1;
                         state.put_back(batch);
                     } else {
-                        tracing::error!(%error, keys = ?batch.keys, "a key is not written; its service is told by a notice alone");
+                        tracing::error!(
+                            %error,
+                            keys = ?batch.keys,
+                            "a key is not written; its service is told by a notice alone",
+                        );
                         state.counts.dropped += 1;
                         state.put_back(batch.without_keys());
                     }
                 }
                 // Whoever is refused alone would be refused again, and must not hold up the others.
-                Err(error) if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 => {
+                Err(error)
+                    if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 =>
+                {
                     let place = batch.waiting.first().map(|(place, _)| place.as_str());
-                    tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
+                    tracing::error!(
+                        %error,
+                        place,
+                        keys = ?batch.keys,
+                        "a service is not told of its configuration",
+                    );
                     let mut state = self.shared.state.lock();
                     state.busy.clear();
                     state.counts.dropped += 1;
                 }
                 Err(OutletError::NotYet { channels, reason }) => {
-                    tracing::debug!(channels = channels.len(), reason, "services could not be told yet");
+                    tracing::debug!(
+                        channels = channels.len(),
+                        reason,
+                        "services could not be told yet"
+                    );
                     aside.get_or_insert(Instant::now() + ASIDE);
                     let mut state = self.shared.state.lock();
                     state.counts.failures += 1;
@@ -249,7 +259,10 @@ impl Speaker {
                 Err(error) => {
                     let words = error.to_string();
                     if trouble.as_ref() != Some(&words) && !error.is_refusal() {
-                        tracing::warn!(error = words, "services cannot be told now; it is tried again");
+                        tracing::warn!(
+                            error = words,
+                            "services cannot be told now; it is tried again"
+                        );
                     }
                     trouble = Some(words);
                     {
@@ -268,7 +281,8 @@ impl Speaker {
         }
     }
 
-    /// Looks for keys of before, if that is due; those that cannot be looked for now are looked for later. Returns whether it did.
+    /// Looks for keys of before, if that is due; those that cannot be looked for now are looked for
+    /// later. Returns whether it did.
     async fn sweep(&self, outlet: &dyn Outlet) -> bool {
         let cleared = {
             let mut state = self.shared.state.lock();
@@ -289,7 +303,10 @@ impl Speaker {
                 true
             }
             Err(error) if error.is_refusal() => {
-                tracing::warn!(%error, "keys of before were not looked for: those that nobody wants any more stay");
+                tracing::warn!(
+                    %error,
+                    "keys of before were not looked for: those that nobody wants any more stay",
+                );
                 true
             }
             Err(error) => {

@@ -25,19 +25,19 @@ struct Fake {
 
 #[async_trait]
 impl Outlet for Fake {
-    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
+    async fn deliver(
+        &self,
+        changes: &[KeyChange],
+        messages: &[KeyedMessage],
+    ) -> Result<(), OutletError> {
         if !*self.is_up.borrow() {
             return Err(OutletError::Away("switched off".to_owned()));
         }
-        if messages
-            .iter()
-            .any(|message| Some(message.channel.as_str()) == self.refused)
-        {
+        if messages.iter().any(|message| Some(message.channel.as_str()) == self.refused) {
             return Err(OutletError::TooLarge { bytes: 1 });
         }
-        let missing = messages
-            .iter()
-            .find(|message| Some(message.channel.as_str()) == self.missing);
+        let missing =
+            messages.iter().find(|message| Some(message.channel.as_str()) == self.missing);
         if let Some(message) = missing {
             return Err(OutletError::NotYet {
                 channels: [message.channel.clone()].into(),
@@ -51,10 +51,7 @@ impl Outlet for Fake {
         if changes.iter().any(|change| change.key() == "blaze:config:forbidden") {
             return Err(OutletError::KeysAlone(KeyError::Refused { place, reason }));
         }
-        self.delivered
-            .send((changes.to_vec(), messages.to_vec()))
-            .await
-            .unwrap();
+        self.delivered.send((changes.to_vec(), messages.to_vec())).await.unwrap();
         Ok(())
     }
 
@@ -96,14 +93,7 @@ fn world(is_up: bool) -> World {
     });
     let mut run = tokio::task::JoinSet::new();
     run.spawn(speaker.clone().run(outlet));
-    World {
-        speaker,
-        up,
-        keys,
-        lost,
-        delivered,
-        _run: run,
-    }
+    World { speaker, up, keys, lost, delivered, _run: run }
 }
 
 fn told(place: &str, text: &'static str) -> Told {
@@ -134,11 +124,7 @@ async fn of_what_waits_the_newest_of_each_place_is_told_once() {
     w.speaker.tell([told("slam", "3")]);
     w.up.send_replace(true);
     let first = w.delivered.recv().await.unwrap();
-    assert_eq!(
-        texts(&first),
-        ["1", "3"],
-        "a newer one comes after what was told meanwhile"
-    );
+    assert_eq!(texts(&first), ["1", "3"], "a newer one comes after what was told meanwhile");
     assert_eq!(first.0.len(), 2);
     tokio::time::sleep(Duration::from_secs(5)).await;
     assert!(w.delivered.is_empty());
@@ -151,26 +137,14 @@ async fn keys_that_the_server_has_lost_are_written_again_without_a_notice() {
     let mut w = world(true);
     w.speaker.tell([told("slam", "1"), told("nav", "1")]);
     w.delivered.recv().await.unwrap();
-    w.speaker.tell([Told {
-        key: Some(("blaze:config:nav".to_owned(), None)),
-        ..told("nav", "gone")
-    }]);
+    w.speaker
+        .tell([Told { key: Some(("blaze:config:nav".to_owned(), None)), ..told("nav", "gone") }]);
     let gone = w.delivered.recv().await.unwrap();
-    assert_eq!(
-        gone.0,
-        [KeyChange::Delete {
-            key: "blaze:config:nav".to_owned()
-        }]
-    );
+    assert_eq!(gone.0, [KeyChange::Delete { key: "blaze:config:nav".to_owned() }]);
     w.lost.notify_one();
     let again = w.delivered.recv().await.unwrap();
-    let old = KeyChange::Delete {
-        key: "blaze:config:old".to_owned(),
-    };
-    let slam = KeyChange::Put {
-        key: "blaze:config:slam".to_owned(),
-        value: Bytes::from("1"),
-    };
+    let old = KeyChange::Delete { key: "blaze:config:old".to_owned() };
+    let slam = KeyChange::Put { key: "blaze:config:slam".to_owned(), value: Bytes::from("1") };
     assert_eq!(again, (vec![slam], Vec::new()));
     let swept = w.delivered.recv().await.unwrap();
     assert_eq!(swept, (vec![old], Vec::new()), "and one that nobody wants goes");
@@ -184,11 +158,8 @@ fn what_came_meanwhile_is_newer_than_what_goes_back() {
     state.put(told("slam", "2"));
     state.put_back(batch);
     let left = state.take(BATCH);
-    let texts: Vec<_> = left
-        .waiting
-        .iter()
-        .filter_map(|(_, waiting)| waiting.notice.value.clone())
-        .collect();
+    let texts: Vec<_> =
+        left.waiting.iter().filter_map(|(_, waiting)| waiting.notice.value.clone()).collect();
     assert_eq!(texts, ["2"]);
     assert_eq!(state.changes(&left.keys).len(), 1);
     assert!(state.take(BATCH).is_empty());
@@ -206,18 +177,14 @@ fn of_two_places_with_one_key_the_last_word_counts() {
     state.put(moved("slam-at-a", None));
     state.put(moved("slam-at-b", Some("2")));
     let batch = state.take(BATCH);
-    let put = KeyChange::Put {
-        key: "blaze:config:slam:0".to_owned(),
-        value: Bytes::from("2"),
-    };
+    let put = KeyChange::Put { key: "blaze:config:slam:0".to_owned(), value: Bytes::from("2") };
     assert_eq!(state.changes(&batch.keys), [put]);
 }
 
 #[tokio::test(start_paused = true)]
 async fn whom_the_broker_refuses_holds_up_nobody_else() {
     let mut w = world(true);
-    w.speaker
-        .tell([told("nav", "1"), told("refused", "1"), told("slam", "1")]);
+    w.speaker.tell([told("nav", "1"), told("refused", "1"), told("slam", "1")]);
     let mut heard = Vec::new();
     while heard.len() < 2 {
         heard.extend(texts(&w.delivered.recv().await.unwrap()));
@@ -275,10 +242,7 @@ fn a_place_waits_since_its_first_notice_that_was_not_taken() {
     assert_eq!(state.waits_since("a", true), Some(5));
     state.put_back(batch);
     state.set_aside(&["blaze/config/changed/slam".parse().unwrap()].into());
-    assert_eq!(
-        (state.waits_since("a", false), state.waits_since("a", true)),
-        (Some(6), Some(5))
-    );
+    assert_eq!((state.waits_since("a", false), state.waits_since("a", true)), (Some(6), Some(5)));
     assert_eq!(state.waits_since("b", true), Some(0), "of another store");
     assert!(state.is_waiting("slam") && !state.is_waiting("log"));
 }
@@ -321,10 +285,7 @@ async fn notices_go_on_while_the_keys_wait_for_their_server() {
         assert_eq!((texts(&delivered).len(), delivered.0.len()), (2, 0));
     }
     tokio::time::sleep(Duration::from_secs(5)).await;
-    assert!(
-        w.delivered.is_empty(),
-        "each notice was told once, and no key was written"
-    );
+    assert!(w.delivered.is_empty(), "each notice was told once, and no key was written");
     assert!(w.speaker.counts().notices == 6 && w.speaker.waits_since("", false).is_none());
     w.keys.send_replace(true);
     let written = w.delivered.recv().await.unwrap();
@@ -338,8 +299,7 @@ async fn notices_go_on_while_the_keys_wait_for_their_server() {
 #[tokio::test(start_paused = true)]
 async fn whose_key_is_refused_is_told_without_it_and_the_others_have_theirs() {
     let mut w = world(true);
-    w.speaker
-        .tell([told("slam", "1"), told("forbidden", "1"), told("nav", "1")]);
+    w.speaker.tell([told("slam", "1"), told("forbidden", "1"), told("nav", "1")]);
     let (mut keys, mut places) = (Vec::new(), Vec::new());
     while places.len() < 3 || keys.len() < 2 {
         let (changes, messages) = w.delivered.recv().await.unwrap();

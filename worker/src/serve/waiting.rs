@@ -10,8 +10,8 @@ use bytes::Bytes;
 use super::{SpeakerCounts, Told};
 use crate::lease::Mark;
 
-/// Bytes of one transaction, unless one place alone has more (1 MiB): a large one over a slow connection would not be done in
-/// the time that a call may take, and be tried again for ever.
+/// Bytes of one transaction, unless one place alone has more (1 MiB): a large one over a slow
+/// connection would not be done in the time that a call may take, and be tried again for ever.
 pub(super) const BATCH_BYTES: usize = 1024 * 1024;
 
 /// A notice that waits.
@@ -29,7 +29,8 @@ pub(super) struct State {
     wanted: BTreeMap<String, Bytes>,
     /// Keys that are not as they should be; those that are not wanted are to go.
     dirty: BTreeSet<String>,
-    /// Places in the order in which they are told of; each stands here once, but for those that were set aside.
+    /// Places in the order in which they are told of; each stands here once, but for those that
+    /// were set aside.
     pub(super) order: BTreeMap<i64, String>,
     pub(super) waiting: BTreeMap<String, (i64, Waiting)>,
     /// Of the last that was put at the end, and of the first.
@@ -72,8 +73,8 @@ impl Batch {
 }
 
 impl State {
-    /// Takes in what is newer than what waits of the same place; it is told at the end, so that the notices of a service come
-    /// in the order of their revisions.
+    /// Takes in what is newer than what waits of the same place; it is told at the end, so that the
+    /// notices of a service come in the order of their revisions.
     pub(super) fn put(&mut self, told: Told) {
         let Told { place, key, notice } = told;
         let name = key.map(|(name, value)| {
@@ -94,17 +95,12 @@ impl State {
         self.ends.1 += 1;
         self.order.insert(self.ends.1, place.clone());
         let key = name;
-        self.waiting
-            .insert(place, (self.ends.1, Waiting { key, notice, since }));
+        self.waiting.insert(place, (self.ends.1, Waiting { key, notice, since }));
     }
 
     /// The first that wait, at most so many and, but for the first, so many bytes.
     pub(super) fn take(&mut self, most: usize) -> Batch {
-        let mut batch = Batch {
-            keys: BTreeSet::new(),
-            waiting: Vec::new(),
-            cleared: self.cleared,
-        };
+        let mut batch = Batch { keys: BTreeSet::new(), waiting: Vec::new(), cleared: self.cleared };
         let mut bytes = 0;
         while batch.waiting.len() < most
             && (bytes < BATCH_BYTES || batch.is_empty())
@@ -130,9 +126,7 @@ impl State {
             batch.keys.insert(key);
         }
         let places = batch.waiting.iter();
-        self.busy = places
-            .map(|(place, waiting)| (place.clone(), waiting.since.clone()))
-            .collect();
+        self.busy = places.map(|(place, waiting)| (place.clone(), waiting.since.clone())).collect();
         batch
     }
 
@@ -153,20 +147,13 @@ impl State {
 
     /// Everything is forgotten, also what is on its way and comes back.
     pub(super) fn clear(&mut self) {
-        *self = Self {
-            cleared: self.cleared + 1,
-            counts: self.counts,
-            ..Self::default()
-        };
+        *self = Self { cleared: self.cleared + 1, counts: self.counts, ..Self::default() };
     }
 
     /// Keys as they should be now.
     pub(super) fn changes(&self, keys: &BTreeSet<String>) -> Vec<KeyChange> {
         let change = |key: &String| match self.wanted.get(key) {
-            Some(value) => KeyChange::Put {
-                key: key.clone(),
-                value: value.clone(),
-            },
+            Some(value) => KeyChange::Put { key: key.clone(), value: value.clone() },
             None => KeyChange::Delete { key: key.clone() },
         };
         keys.iter().map(change).collect()

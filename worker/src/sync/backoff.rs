@@ -11,16 +11,16 @@ const LATER: Duration = Duration::from_secs(30);
 /// What a short while is.
 const RECENT: Duration = Duration::from_secs(5 * 60);
 
-/// Waits with full jitter: anything from nothing to an upper bound that doubles with every failure, so that a fleet that lost
-/// its main service at one moment does not come back at one moment.
+/// Waits with full jitter: anything from nothing to an upper bound that doubles with every failure,
+/// so that a fleet that lost its main service at one moment does not come back at one moment.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Backoff {
     failures: u32,
 }
 
 impl Backoff {
-    /// The next wait. `since_contact` is the time since the main service last said something (`None`: never), `random` a
-    /// number of at least 0 and below 1.
+    /// The next wait. `since_contact` is the time since the main service last said something
+    /// (`None`: never), `random` a number of at least 0 and below 1.
     pub fn next(&mut self, since_contact: Option<Duration>, random: f64) -> Duration {
         let most = match since_contact {
             Some(since) if since < RECENT => SOON,

@@ -1,5 +1,5 @@
-//! Keeps a stream to the main service open: connects, greets, hands on what comes, says what the worker has; after an end of
-//! any kind it waits and begins anew.
+//! Keeps a stream to the main service open: connects, greets, hands on what comes, says what the
+//! worker has; after an end of any kind it waits and begins anew.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -27,14 +27,16 @@ const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
 const CONNECT: Duration = Duration::from_millis(1500);
 /// Time for files to be read, a connection to come about and TLS to be agreed upon.
 const REACH: Duration = Duration::from_secs(5);
-/// The main service says something every 15 s; one that is silent for so long is as good as away, whatever its host answers.
+/// The main service says something every 15 s; one that is silent for so long is as good as away,
+/// whatever its host answers.
 const SILENCE: Duration = Duration::from_secs(45);
 /// A stream that ended sooner was none: the next one is not tried at once.
 const GOOD: Duration = Duration::from_secs(10);
 /// Time for the answer to Hello.
 const WELCOME: Duration = Duration::from_secs(10);
-/// Between two looks whether the other end is still there. A cut link loses packets without a word, and TCP sends again in
-/// steps that double: after 30 s the next one comes only 25 s later. So this end notices by itself, and connects anew.
+/// Between two looks whether the other end is still there. A cut link loses packets without a word,
+/// and TCP sends again in steps that double: after 30 s the next one comes only 25 s later. So this
+/// end notices by itself, and connects anew.
 const ALIVE: Duration = Duration::from_secs(3);
 /// Time for the answer to such a look.
 const ALIVE_ANSWER: Duration = Duration::from_secs(3);
@@ -110,7 +112,8 @@ pub enum SyncEvent {
         /// Where the answer goes.
         answer: oneshot::Sender<v1::Hello>,
     },
-    /// The main service has accepted it. Cancelling the token ends this stream, and the next greeting is asked for.
+    /// The main service has accepted it. Cancelling the token ends this stream, and the next
+    /// greeting is asked for.
     Opened(CancellationToken),
     /// It has said something.
     Said(Incoming),
@@ -123,7 +126,8 @@ pub enum SyncEvent {
     },
 }
 
-/// Follows the main service until `stop`. What the worker has (`acks`) is said whenever it changes; the newest counts.
+/// Follows the main service until `stop`. What the worker has (`acks`) is said whenever it changes;
+/// the newest counts.
 pub async fn follow(
     main: watch::Receiver<MainService>,
     events: mpsc::Sender<SyncEvent>,
@@ -176,20 +180,15 @@ impl Client {
                 backoff.reset();
             }
             tracing::debug!(reason = end.reason, "not connected with the main service");
-            let closed = SyncEvent::Closed {
-                reason: end.reason,
-                is_unreadable: end.is_unreadable,
-            };
+            let closed = SyncEvent::Closed { reason: end.reason, is_unreadable: end.is_unreadable };
             if self.events.send(closed).await.is_err() {
                 return;
             }
             let since = Some(contact.elapsed());
             let pause = backoff.next(since, rand::random());
-            // The main service knows best; a wish of our own counts only if it is not the next of many.
-            let wait = end
-                .again
-                .filter(|again| end.was_good || !again.is_zero())
-                .unwrap_or(pause);
+            // The main service knows best; a wish of our own counts only if it is not the next of
+            // many.
+            let wait = end.again.filter(|again| end.was_good || !again.is_zero()).unwrap_or(pause);
             tokio::select! {
                 () = tokio::time::sleep(wait) => {}
                 // Another address is worth a try at once; without a sender there is none.
@@ -201,7 +200,9 @@ impl Client {
     /// One stream from its beginning to its end.
     async fn once(&mut self) -> Result<End, ConnectError> {
         let main = self.main.borrow().clone();
-        let reached = tokio::time::timeout(REACH, async { Ok((token(&main).await?, channel(&main).await?)) }).await;
+        let reached =
+            tokio::time::timeout(REACH, async { Ok((token(&main).await?, channel(&main).await?)) })
+                .await;
         let (token, channel) = reached.unwrap_or_else(|_| {
             let reason = format!("no connection within {} s", REACH.as_secs());
             Err(ConnectError::Transport(reason))
@@ -224,13 +225,15 @@ impl Client {
         // What the last stream said is nothing to this one until the engine says it again.
         let mut acks = self.acks.clone();
         acks.mark_unchanged();
-        let acks = WatchStream::from_changes(acks).filter_map(|ack| async move { ack.map(Msg::Ack) });
+        let acks =
+            WatchStream::from_changes(acks).filter_map(|ack| async move { ack.map(Msg::Ack) });
         let said = futures::stream::iter([Msg::Hello(hello)]).chain(acks);
         let mut request = Request::new(said.map(|msg| v1::SyncRequest { msg: Some(msg) }));
         if let Some(token) = token {
             request.metadata_mut().insert("authorization", token);
         }
-        let mut client = SyncServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE_BYTES);
+        let mut client =
+            SyncServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE_BYTES);
         match tokio::time::timeout(WELCOME, client.sync(request)).await {
             Ok(Ok(response)) => Ok(response.into_inner()),
             Ok(Err(status)) => Err(ConnectError::Refused(status)),
@@ -252,7 +255,10 @@ impl Client {
             let message = tokio::select! {
                 message = tokio::time::timeout(SILENCE, stream.message()) => match message {
                     Ok(message) => message,
-                    Err(_) => break format!("the main service has said nothing for {} s", SILENCE.as_secs()),
+                    Err(_) => break format!(
+                        "the main service has said nothing for {} s",
+                        SILENCE.as_secs(),
+                    ),
                 },
                 () = restart.cancelled() => {
                     again = Some(Duration::ZERO);
@@ -312,8 +318,8 @@ async fn token(main: &MainService) -> Result<Option<MetadataValue<Ascii>>, Conne
 }
 
 async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
-    let endpoint =
-        Endpoint::from_shared(main.server.clone()).map_err(|error| ConnectError::Address(error.to_string()))?;
+    let endpoint = Endpoint::from_shared(main.server.clone())
+        .map_err(|error| ConnectError::Address(error.to_string()))?;
     let endpoint = endpoint
         .connect_timeout(CONNECT)
         .tcp_nodelay(true)
@@ -326,39 +332,34 @@ async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
             let tls = ClientTlsConfig::new().timeout(CONNECT);
             let tls = match &main.ca_file {
                 None => tls.with_native_roots(),
-                Some(path) => tls.ca_certificate(Certificate::from_pem(pem("config.ca_file", path).await?)),
+                Some(path) => {
+                    tls.ca_certificate(Certificate::from_pem(pem("config.ca_file", path).await?))
+                }
             };
             let tls = match &main.certificate {
                 None => tls,
                 Some((certificate, key)) => {
                     let certificate = pem("config.cert_file", certificate).await?;
-                    tls.identity(Identity::from_pem(certificate, pem("config.key_file", key).await?))
+                    tls.identity(Identity::from_pem(
+                        certificate,
+                        pem("config.key_file", key).await?,
+                    ))
                 }
             };
-            endpoint
-                .tls_config(tls)
-                .map_err(|error| ConnectError::Transport(chain(&error)))?
+            endpoint.tls_config(tls).map_err(|error| ConnectError::Transport(chain(&error)))?
         }
     };
-    endpoint
-        .connect()
-        .await
-        .map_err(|error| ConnectError::Transport(chain(&error)))
+    endpoint.connect().await.map_err(|error| ConnectError::Transport(chain(&error)))
 }
 
 /// What a file in PEM form holds; `key` names it in the node file.
 async fn pem(key: &'static str, path: &Path) -> Result<Vec<u8>, ConnectError> {
-    let refuse = |reason| ConnectError::File {
-        key,
-        path: path.to_owned(),
-        reason,
-    };
+    let refuse = |reason| ConnectError::File { key, path: path.to_owned(), reason };
     let text = read(path, MAX_PEM_BYTES).await.map_err(refuse)?;
-    // The library takes a file without any for one with none, and then only the other end says that something is missing.
+    // The library takes a file without any for one with none, and then only the other end says that
+    // something is missing.
     let has_some = text.windows(PEM.len()).any(|start| start == PEM);
-    has_some
-        .then_some(text)
-        .ok_or_else(|| refuse("it holds nothing in PEM form".to_owned()))
+    has_some.then_some(text).ok_or_else(|| refuse("it holds nothing in PEM form".to_owned()))
 }
 
 /// What a refusal says, with what caused it where the connection broke.
@@ -371,7 +372,8 @@ fn words(status: &Status) -> String {
     // As TLS names it. It comes after the connection does, in answer to the first call.
     match text.contains("CertificateRequired") {
         true => format!(
-            "the main service asks for a client certificate: name it with config.cert_file and config.key_file [{text}]"
+            "the main service asks for a client certificate: name it with config.cert_file and \
+             config.key_file [{text}]"
         ),
         false => text,
     }
@@ -407,10 +409,7 @@ mod tests {
             ("http://127.0.0.1@evil.example.org", false),
             ("ftp://127.0.0.1", false),
         ] {
-            let main = MainService {
-                server: server.to_owned(),
-                ..MainService::default()
-            };
+            let main = MainService { server: server.to_owned(), ..MainService::default() };
             assert_eq!(main.is_safe(), is_safe, "{server}");
         }
     }

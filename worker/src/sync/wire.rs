@@ -54,10 +54,9 @@ impl TryFrom<v1::SyncResponse> for Incoming {
             }),
             Msg::Snapshot(snapshot) => from_snapshot(snapshot),
             Msg::Commit(commit) => from_commit(commit),
-            Msg::Bookmark(bookmark) => Ok(Self::Bookmark {
-                revision: bookmark.revision,
-                digest: bookmark.digest,
-            }),
+            Msg::Bookmark(bookmark) => {
+                Ok(Self::Bookmark { revision: bookmark.revision, digest: bookmark.digest })
+            }
             Msg::GoAway(go_away) => Ok(Self::GoAway {
                 retry_after: Duration::from_millis(go_away.retry_after_ms.into()),
                 reason: go_away.reason,
@@ -71,13 +70,9 @@ fn from_snapshot(snapshot: v1::Snapshot) -> Result<Incoming, IncomingError> {
     let documents = snapshot.documents.into_iter().map(Document::try_from);
     Ok(Incoming::Snapshot {
         revision,
-        documents: documents
-            .collect::<Result<_, _>>()
-            .map_err(|error| IncomingError::Document {
-                message: "the snapshot",
-                revision,
-                error,
-            })?,
+        documents: documents.collect::<Result<_, _>>().map_err(|error| {
+            IncomingError::Document { message: "the snapshot", revision, error }
+        })?,
         last: snapshot.last,
     })
 }
@@ -102,10 +97,9 @@ fn edit(revision: u64, change: v1::Change) -> Result<Edit, IncomingError> {
     match v1::Op::try_from(change.op) {
         Ok(v1::Op::Create | v1::Op::Update | v1::Op::Rollback) => Ok(Edit::Put(document)),
         Ok(v1::Op::Delete | v1::Op::Leave) => Ok(Edit::Remove(document.key)),
-        Ok(v1::Op::Unspecified | v1::Op::Unchanged) | Err(_) => Err(IncomingError::Op {
-            revision,
-            op: change.op,
-        }),
+        Ok(v1::Op::Unspecified | v1::Op::Unchanged) | Err(_) => {
+            Err(IncomingError::Op { revision, op: change.op })
+        }
     }
 }
 
@@ -149,12 +143,7 @@ mod tests {
             (v1::Op::Leave, false),
         ] {
             let found = commit(op.into(), Some(document("robot-1"))).unwrap();
-            let Incoming::Commit {
-                revision: 7,
-                previous: 5,
-                edits,
-            } = &found
-            else {
+            let Incoming::Commit { revision: 7, previous: 5, edits } = &found else {
                 panic!("{op:?} is not taken as a commit: {found:?}");
             };
             let key = match &edits[..] {

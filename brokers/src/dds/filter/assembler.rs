@@ -1,6 +1,7 @@
 //! Classic BPF with labels instead of jump offsets.
 //!
-//! The machine has an accumulator A, an index register X, 16 words of memory, and jumps forward only.
+//! The machine has an accumulator A, an index register X, 16 words of memory, and jumps forward
+//! only.
 
 /// One instruction, as the kernel takes it (`struct sock_filter`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -132,15 +133,11 @@ impl Assembler {
     }
 
     fn push(&mut self, code: u16, k: u32) {
-        self.code.push(Instruction {
-            code,
-            if_true: 0,
-            if_false: 0,
-            k,
-        });
+        self.code.push(Instruction { code, if_true: 0, if_false: 0, k });
     }
 
-    /// The program with all jumps resolved; `None` if a label is nowhere, a jump is too far, or the program too long.
+    /// The program with all jumps resolved; `None` if a label is nowhere, a jump is too far, or the
+    /// program too long.
     pub(super) fn finish(mut self) -> Option<Vec<Instruction>> {
         for (at, jump, label) in self.jumps {
             let target = self.labels.get(label.0).copied().flatten()?;

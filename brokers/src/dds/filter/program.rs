@@ -1,7 +1,7 @@
 //! The program: what RustDDS 0.15.1 reads of a datagram, and what must not get there.
 //!
-//! A filter of a UDP socket sees the UDP header at 0. A load beyond the packet ends the program and drops the packet;
-//! RustDDS refuses such a datagram as a whole, too.
+//! A filter of a UDP socket sees the UDP header at 0. A load beyond the packet ends the program and
+//! drops the packet; RustDDS refuses such a datagram as a whole, too.
 
 use super::assembler::{Assembler, Instruction, Label, Op, Test};
 
@@ -29,18 +29,21 @@ const HIGH_BIT_OF_HALF: u32 = 0x8000;
 
 /// RustDDS cuts samples into fragments of this many bytes.
 const FRAGMENT: u32 = 256;
-/// First fragment that a NACK_FRAG may ask for where only samples of discovery are repaired, which have less than one
-/// packet. RustDDS allocates a bit for each fragment before it.
+/// First fragment that a NACK_FRAG may ask for where only samples of discovery are repaired, which
+/// have less than one packet. RustDDS allocates a bit for each fragment before it.
 const MAX_NACK_FRAGMENT: u32 = 0x3ff;
 /// Last fragment of a HEARTBEAT_FRAG, at least.
 const MAX_FRAGMENT: u32 = 0xffff;
 /// Bits of a bitmap. RustDDS takes 256 and no more; this only is the next power of two.
 const MAX_BITS: u32 = 0x1ff;
-/// Width of a HEARTBEAT's range in units of 65,536: up to 2²⁰ numbers, which RustDDS lists with 8 bytes each.
+/// Width of a HEARTBEAT's range in units of 65,536: up to 2²⁰ numbers, which RustDDS lists with 8
+/// bytes each.
 const HEARTBEAT_RANGE: u32 = 15;
-/// Width of a GAP's range: up to 2¹⁷ numbers, of which RustDDS makes a map, and itself sends the 8,192 of a writer.
+/// Width of a GAP's range: up to 2¹⁷ numbers, of which RustDDS makes a map, and itself sends the
+/// 8,192 of a writer.
 const GAP_RANGE: u32 = 1;
-/// A GAP from 1 on says what a writer no longer has. RustDDS sends it over any range and only notes where it ends.
+/// A GAP from 1 on says what a writer no longer has. RustDDS sends it over any range and only notes
+/// where it ends.
 const ANY_RANGE: u32 = 0x7fff;
 
 // Words of memory.
@@ -61,11 +64,12 @@ pub(in super::super) struct Shape {
 }
 
 impl Shape {
-    /// 3,824 of 4,096 possible instructions: enough for all that RustDDS packs into 9000 bytes, and on loopback (65,536)
-    /// for the 128 samples that may wait in a writer of 32 KiB samples.
+    /// 3,824 of 4,096 possible instructions: enough for all that RustDDS packs into 9000 bytes, and
+    /// on loopback (65,536) for the 128 samples that may wait in a writer of 32 KiB samples.
     pub(in super::super) const LARGE: Self = Self { full: 4, quick: 160 };
-    /// What fits into the 20 KiB that a socket has for its options where `net.core.optmem_max` has the value from before
-    /// Linux 6.8; the large one needs 60 KiB. A packet of 1500 bytes holds at most 15 of the link's datagrams.
+    /// What fits into the 20 KiB that a socket has for its options where `net.core.optmem_max` has
+    /// the value from before Linux 6.8; the large one needs 60 KiB. A packet of 1500 bytes holds at
+    /// most 15 of the link's datagrams.
     pub(in super::super) const SMALL: Self = Self { full: 2, quick: 24 };
 }
 
@@ -90,16 +94,8 @@ impl Samples {
     fn masks(self) -> Masks {
         let limit = self.largest.max(1).checked_next_power_of_two().unwrap_or(1 << 31);
         let fragments = (limit / FRAGMENT).max(1) - 1;
-        let nack = if self.repaired {
-            fragments.max(MAX_NACK_FRAGMENT)
-        } else {
-            MAX_NACK_FRAGMENT
-        };
-        Masks {
-            sample: !(limit - 1),
-            nack_fragment: !nack,
-            fragment: !fragments.max(MAX_FRAGMENT),
-        }
+        let nack = if self.repaired { fragments.max(MAX_NACK_FRAGMENT) } else { MAX_NACK_FRAGMENT };
+        Masks { sample: !(limit - 1), nack_fragment: !nack, fragment: !fragments.max(MAX_FRAGMENT) }
     }
 }
 
@@ -152,8 +148,9 @@ fn advance(asm: &mut Assembler) {
     asm.op(Op::ToIndex, 0);
 }
 
-/// Skips a little-endian DATA or INFO_TS. A DATA without length extends to the end of the packet; here what follows
-/// its header is then looked at as if it were submessages, which RustDDS does not.
+/// Skips a little-endian DATA or INFO_TS. A DATA without length extends to the end of the packet;
+/// here what follows its header is then looked at as if it were submessages, which RustDDS does
+/// not.
 fn quick_step(asm: &mut Assembler, other: Label) {
     pass_at_end(asm);
     let known = asm.label();
@@ -173,7 +170,8 @@ fn quick_step(asm: &mut Assembler, other: Label) {
 /// Looks at one submessage of any kind.
 fn full_step(asm: &mut Assembler, masks: Masks) {
     pass_at_end(asm);
-    let [data_frag, heartbeat, gap, acknack, nack_frag, heartbeat_frag] = [(); 6].map(|()| asm.label());
+    let [data_frag, heartbeat, gap, acknack, nack_frag, heartbeat_frag] =
+        [(); 6].map(|()| asm.label());
     let [range, good, bad, next] = [(); 4].map(|()| asm.label());
     asm.op(Op::StoreIndex, POSITION);
     asm.op(Op::LoadWord, 0);
@@ -287,8 +285,9 @@ fn gap_range(asm: &mut Assembler) {
     asm.place(done);
 }
 
-/// Two sequence numbers, at 12 and 20, must be below 2³¹, and their upper halves differ by at most A. RustDDS does
-/// nothing when the second one is less. A sequence number is two words, the upper one first.
+/// Two sequence numbers, at 12 and 20, must be below 2³¹, and their upper halves differ by at most
+/// A. RustDDS does nothing when the second one is less. A sequence number is two words, the upper
+/// one first.
 fn check_range(asm: &mut Assembler, bad: Label) {
     let [little, compare, ordered, done] = [(); 4].map(|()| asm.label());
     asm.op(Op::Store, RANGE);
@@ -321,7 +320,8 @@ fn check_range(asm: &mut Assembler, bad: Label) {
     asm.op(Op::RecallIndex, POSITION);
 }
 
-/// Moves X to the next submessage. Without length PAD and INFO_TS are empty, and all others extend to the end.
+/// Moves X to the next submessage. Without length PAD and INFO_TS are empty, and all others extend
+/// to the end.
 fn skip_body(asm: &mut Assembler) {
     let [little, big, filled, empty] = [(); 4].map(|()| asm.label());
     asm.op(Op::Recall, HEAD);

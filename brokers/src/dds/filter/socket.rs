@@ -1,7 +1,8 @@
 //! Attaching the filter to the sockets that RustDDS keeps to itself.
 //!
-//! The kernel lists the UDP sockets of the network namespace with their ports and inodes, and the files of this process
-//! with their inodes. A duplicate of such a file is the same socket, and so is its filter.
+//! The kernel lists the UDP sockets of the network namespace with their ports and inodes, and the
+//! files of this process with their inodes. A duplicate of such a file is the same socket, and so
+//! is its filter.
 
 use std::collections::{HashMap, HashSet};
 use std::fs;
@@ -28,7 +29,8 @@ pub(in super::super) struct Attached {
 }
 
 impl Attached {
-    /// Datagrams that the kernel dropped at these sockets until now, by the filter or because no room was left.
+    /// Datagrams that the kernel dropped at these sockets until now, by the filter or because no
+    /// room was left.
     pub(in super::super) fn dropped(&self) -> u64 {
         udp_sockets().map_or(0, |sockets| {
             let ours = sockets.iter().filter(|socket| self.inodes.contains(&socket.inode));
@@ -46,7 +48,8 @@ pub(super) struct UdpSocketLine {
 }
 
 impl UdpSocketLine {
-    /// `sl local_address rem_address st tx_queue:rx_queue tr:tm->when retrnsmt uid timeout inode ref pointer drops`
+    /// `sl local_address rem_address st tx_queue:rx_queue tr:tm->when retrnsmt uid timeout inode
+    /// ref pointer drops`
     pub(super) fn parse(line: &str) -> Option<Self> {
         let fields: Vec<&str> = line.split_ascii_whitespace().collect();
         let (_, port) = fields.get(1)?.rsplit_once(':')?;
@@ -88,15 +91,13 @@ pub(in super::super) fn attach(ports: &[u16], samples: Samples) -> Result<Attach
     let own = own_sockets().map_err(system("the own sockets are not known"))?;
     let all = udp_sockets().map_err(system("the UDP sockets are not known"))?;
     let this = pidfd_open(getpid(), PidfdFlags::empty()).map_err(errno("pidfd_open"))?;
-    let mut attached = Attached {
-        inodes: HashSet::new(),
-        shape: Shape::LARGE,
-    };
+    let mut attached = Attached { inodes: HashSet::new(), shape: Shape::LARGE };
     for found in all.iter().filter(|socket| ports.contains(&socket.port)) {
         let Some(descriptor) = own.get(&found.inode) else {
             continue;
         };
-        let duplicate = pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty()).map_err(errno("pidfd_getfd"))?;
+        let duplicate = pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty())
+            .map_err(errno("pidfd_getfd"))?;
         if let Some(socket) = still_bound(duplicate, found.port) {
             attach_one(&socket, samples, &mut attached.shape)?;
             attached.inodes.insert(found.inode);
@@ -120,13 +121,13 @@ fn attach_one(socket: &Socket, samples: Samples, shape: &mut Shape) -> Result<()
     if *shape == Shape::LARGE {
         match socket.attach_filter(&filters(Shape::LARGE, samples)?) {
             Ok(()) => return Ok(()),
-            Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => *shape = Shape::SMALL,
+            Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => {
+                *shape = Shape::SMALL
+            }
             Err(error) => return Err(system("the filter was refused")(error)),
         }
     }
-    socket
-        .attach_filter(&filters(*shape, samples)?)
-        .map_err(system("the filter was refused"))
+    socket.attach_filter(&filters(*shape, samples)?).map_err(system("the filter was refused"))
 }
 
 fn filters(shape: Shape, samples: Samples) -> Result<Vec<SockFilter>, FilterError> {

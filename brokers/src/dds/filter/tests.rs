@@ -37,12 +37,10 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
         } else if is(Op::Return) {
             return it.k;
         } else if is(Op::LoadWordAt) || is(Op::LoadWord) || is(Op::LoadHalf) {
-            let from = if is(Op::LoadWordAt) {
-                Some(it.k)
-            } else {
-                x.checked_add(it.k)
-            };
-            let Some(value) = from.and_then(|from| load(from, if is(Op::LoadHalf) { 2 } else { 4 })) else {
+            let from = if is(Op::LoadWordAt) { Some(it.k) } else { x.checked_add(it.k) };
+            let Some(value) =
+                from.and_then(|from| load(from, if is(Op::LoadHalf) { 2 } else { 4 }))
+            else {
                 return 0;
             };
             a = value;
@@ -70,10 +68,7 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
 }
 
 const LARGEST: u32 = 60 * 1024 + 8;
-const SAMPLES: Samples = Samples {
-    largest: LARGEST,
-    repaired: false,
-};
+const SAMPLES: Samples = Samples { largest: LARGEST, repaired: false };
 
 fn passes_shape(shape: Shape, datagram: &[u8]) -> bool {
     let mut packet = vec![0; 8];
@@ -167,13 +162,8 @@ impl Endian {
     }
 
     fn nack_frag(self, number: i64, fragment: u32, bits: u32) -> Vec<u8> {
-        let body = [
-            vec![1; 8],
-            self.number(number),
-            self.word(fragment),
-            self.word(bits),
-            vec![0; 36],
-        ];
+        let body =
+            [vec![1; 8], self.number(number), self.word(fragment), self.word(bits), vec![0; 36]];
         self.submessage(0x12, &body.concat())
     }
 
@@ -259,18 +249,29 @@ fn what_exhausts_rustdds_is_dropped_wherever_it_stands() {
             for other in BOTH {
                 let alone = message(std::slice::from_ref(&bad));
                 assert!(!passes(&alone), "{e:?} {bad:02x?}");
-                let after = message(&[other.info_ts(), other.data(100), other.info_dst(), bad.clone()]);
+                let after =
+                    message(&[other.info_ts(), other.data(100), other.info_dst(), bad.clone()]);
                 assert!(!passes(&after), "after {other:?}: {bad:02x?}");
                 let before = message(&[bad.clone(), other.data(100)]);
                 assert!(!passes(&before), "before {other:?}: {bad:02x?}");
                 // Behind submessages without length that are not the last.
-                let pad = message(&[other.submessage(0x01, &[]), other.submessage(0x09, &[]), bad.clone()]);
+                let pad = message(&[
+                    other.submessage(0x01, &[]),
+                    other.submessage(0x09, &[]),
+                    bad.clone(),
+                ]);
                 assert!(!passes(&pad), "behind {other:?} padding: {bad:02x?}");
                 for run in 0..24 {
                     let mut many = vec![other.data(8); run];
                     many.push(bad.clone());
-                    assert!(!passes_shape(Shape::LARGE, &message(&many)), "behind {run}: {bad:02x?}");
-                    assert!(!passes_shape(Shape::SMALL, &message(&many)), "behind {run}: {bad:02x?}");
+                    assert!(
+                        !passes_shape(Shape::LARGE, &message(&many)),
+                        "behind {run}: {bad:02x?}"
+                    );
+                    assert!(
+                        !passes_shape(Shape::SMALL, &message(&many)),
+                        "behind {run}: {bad:02x?}"
+                    );
                 }
             }
         }
@@ -328,18 +329,8 @@ fn random_messages_agree_with_a_plain_walk() {
         state ^= state << 17;
         state % limit
     };
-    let edges: [i64; 10] = [
-        0,
-        1,
-        2,
-        0xff,
-        0x100,
-        0xffff,
-        0x1_0000,
-        0x10_0000,
-        0x7fff_ffff,
-        0x8000_0000,
-    ];
+    let edges: [i64; 10] =
+        [0, 1, 2, 0xff, 0x100, 0xffff, 0x1_0000, 0x10_0000, 0x7fff_ffff, 0x8000_0000];
     let (mut passed, mut dropped) = (0, 0);
     for _ in 0..20_000 {
         let mut submessages = Vec::new();
@@ -379,16 +370,9 @@ fn random_messages_agree_with_a_plain_walk() {
 fn the_kernels_list_is_read() {
     let line = "  512: 0100007F:306B 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 4711 2 \
                 0000000000000000 23";
-    let expected = UdpSocketLine {
-        port: 12_395,
-        inode: 4711,
-        dropped: 23,
-    };
+    let expected = UdpSocketLine { port: 12_395, inode: 4711, dropped: 23 };
     assert_eq!(UdpSocketLine::parse(line), Some(expected));
-    assert_eq!(
-        UdpSocketLine::parse("  sl  local_address rem_address   st tx_queue"),
-        None
-    );
+    assert_eq!(UdpSocketLine::parse("  sl  local_address rem_address   st tx_queue"), None);
     assert_eq!(UdpSocketLine::parse(""), None);
 }
 
@@ -430,10 +414,7 @@ fn the_kernel_takes_the_filter_and_drops_what_it_must() {
 
 #[test]
 fn fragments_of_large_samples_are_asked_for_where_they_are_repaired() {
-    let samples = |repaired| Samples {
-        largest: 16 << 20,
-        repaired,
-    };
+    let samples = |repaired| Samples { largest: 16 << 20, repaired };
     for e in BOTH {
         for (fragment, passes) in [(1, true), (1023, true), (1024, false), (65_535, false)] {
             let packet = [vec![0; 8], message(&[e.nack_frag(1, fragment, 1)])].concat();

@@ -114,18 +114,8 @@ impl Channel {
     fn drain(&self, shared: &Shared) {
         self.is_ready.store(false, Ordering::Release);
         let mut readers = self.readers.lock();
-        let Readers {
-            reliable,
-            best_effort,
-            opened,
-            seen,
-            history,
-        } = &mut *readers;
-        let mut progress = Progress {
-            opened: opened.unwrap_or(Timestamp::ZERO),
-            seen,
-            history,
-        };
+        let Readers { reliable, best_effort, opened, seen, history } = &mut *readers;
+        let mut progress = Progress { opened: opened.unwrap_or(Timestamp::ZERO), seen, history };
         let mut again = false;
         for (reader, kind) in [(reliable, Kind::Reliable), (best_effort, Kind::BestEffort)] {
             let Some(reader) = reader else { continue };
@@ -174,15 +164,20 @@ impl Channel {
         }
     }
 
-    /// Whether it holds messages that were kept, until their writers are quiet. Not to be waited for while a reader is made.
+    /// Whether it holds messages that were kept, until their writers are quiet. Not to be waited
+    /// for while a reader is made.
     fn holds_history(&self) -> bool {
-        self.readers
-            .try_lock()
-            .is_some_and(|readers| !readers.history.is_empty())
+        self.readers.try_lock().is_some_and(|readers| !readers.history.is_empty())
     }
 
     /// Returns whether there may be more.
-    fn drain_one(&self, shared: &Shared, reader: &RawReader, kind: Kind, progress: &mut Progress<'_>) -> bool {
+    fn drain_one(
+        &self,
+        shared: &Shared,
+        reader: &RawReader,
+        kind: Kind,
+        progress: &mut Progress<'_>,
+    ) -> bool {
         reader.drain_read_notifications();
         for _ in 0..TURN {
             match reader.try_take_one() {
@@ -190,7 +185,11 @@ impl Channel {
                 Ok(None) => return false,
                 Err(error) => {
                     shared.counts.lock().malformed += 1;
-                    tracing::debug!(topic = &*self.topic, %error, "a sample is no sequence of octets");
+                    tracing::debug!(
+                        topic = &*self.topic,
+                        %error,
+                        "a sample is no sequence of octets",
+                    );
                 }
             }
         }
@@ -264,10 +263,7 @@ impl Channels {
                 weak: weak.clone(),
             });
             let mut by_topic = self.by_topic.write();
-            by_topic
-                .entry(Arc::clone(&key.topic))
-                .or_default()
-                .push(Arc::clone(&made));
+            by_topic.entry(Arc::clone(&key.topic)).or_default().push(Arc::clone(&made));
             made
         });
         // In this order, as the thread that opens it locks them.
@@ -361,7 +357,8 @@ pub(super) fn start(shared: &Arc<Shared>, large: bool) -> Result<StoppableThread
             }
             let of_this = |all: bool| {
                 let mut channels = shared.channels.list();
-                channels.retain(|channel| channel.large == large && (all || channel.holds_history()));
+                channels
+                    .retain(|channel| channel.large == large && (all || channel.holds_history()));
                 channels
             };
             if idle {

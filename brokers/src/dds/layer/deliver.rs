@@ -46,7 +46,8 @@ impl Progress<'_> {
     }
 }
 
-/// Takes a sample of another participant, or what an own writer keeps. Own live messages come by another way.
+/// Takes a sample of another participant, or what an own writer keeps. Own live messages come by
+/// another way.
 pub(super) fn deliver(
     shared: &Shared,
     channel: &Channel,
@@ -93,14 +94,16 @@ pub(super) fn deliver(
         }
         _ => {
             // One that is written now tells how far an unknown clock is behind.
-            let behind_ns = moment.map(|moment| moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
+            let behind_ns =
+                moment.map(|moment| moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
             channel.send_kept(&progress.history.of_writer(writer, behind_ns));
             channel.send(received);
         }
     }
 }
 
-/// When a sample was written and came. `None` for those that nobody keeps, or whose writer does not tell.
+/// When a sample was written and came. `None` for those that nobody keeps, or whose writer does not
+/// tell.
 fn moment_of(
     shared: &Shared,
     facts: Option<WriterFacts>,
@@ -128,10 +131,8 @@ mod tests {
     #[test]
     fn time_of_rustdds_is_time_of_day() {
         let now = nanos(Timestamp::now());
-        let system = std::time::SystemTime::now()
-            .duration_since(std::time::UNIX_EPOCH)
-            .unwrap()
-            .as_nanos();
+        let system =
+            std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap().as_nanos();
         assert!(i128::try_from(system).unwrap() - now < 1_000_000_000);
     }
 }

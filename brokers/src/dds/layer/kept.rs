@@ -1,9 +1,10 @@
 //! What a late joiner begins with: the last `depth` frames of each writer, as their headers say.
 //!
-//! RustDDS forgets what is beyond a writer's depth only every six seconds, so a late joiner may be given more. What it is
-//! given is held until a live sample of the same writer comes, or nothing more for a moment. Its age is told then: of a
-//! participant that sends signs of life one is waited for, and of a plain DDS program, whose clock nobody knows, it is what
-//! it is at least, beside the youngest.
+//! RustDDS forgets what is beyond a writer's depth only every six seconds, so a late joiner may be
+//! given more. What it is given is held until a live sample of the same writer comes, or nothing
+//! more for a moment. Its age is told then: of a participant that sends signs of life one is waited
+//! for, and of a plain DDS program, whose clock nobody knows, it is what it is at least, beside the
+//! youngest.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -28,7 +29,8 @@ struct Held {
 }
 
 impl Held {
-    /// Its frames with their ages. `behind_ns`: how far the writer's clock is behind, where that is known.
+    /// Its frames with their ages. `behind_ns`: how far the writer's clock is behind, where that is
+    /// known.
     fn aged(self, behind_ns: Option<i128>) -> impl Iterator<Item = Received> {
         let least_ns = self.frames.iter().map(|(_, moment)| moment.lag_ns()).min();
         let behind_ns = behind_ns.or(least_ns).unwrap_or(0);
@@ -59,11 +61,14 @@ impl History {
         moment: Moment,
     ) -> Option<Received> {
         if self.writers.len() >= MAX_WRITERS && !self.writers.contains_key(&writer) {
-            received.broker_age_us = moment.age_us(moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
+            received.broker_age_us =
+                moment.age_us(moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
             return Some(received);
         }
         let depth = match &received.content {
-            Content::Frame(frame) if frame.depth() > 0 => usize::try_from(frame.depth()).unwrap_or(MAX_FRAMES),
+            Content::Frame(frame) if frame.depth() > 0 => {
+                usize::try_from(frame.depth()).unwrap_or(MAX_FRAMES)
+            }
             // It does not say how many: all that come.
             _ => MAX_FRAMES,
         };
@@ -80,22 +85,30 @@ impl History {
         None
     }
 
-    /// What a writer gave, before a live sample of it. `behind_ns`: how far its clock is behind, where that is known.
-    pub(super) fn of_writer(&mut self, writer: EndpointId, behind_ns: Option<i128>) -> Vec<Received> {
+    /// What a writer gave, before a live sample of it. `behind_ns`: how far its clock is behind,
+    /// where that is known.
+    pub(super) fn of_writer(
+        &mut self,
+        writer: EndpointId,
+        behind_ns: Option<i128>,
+    ) -> Vec<Received> {
         let held = self.writers.remove(&writer);
         held.into_iter().flat_map(|held| held.aged(behind_ns)).collect()
     }
 
     /// What writers gave that give nothing more, or that have been giving for long.
-    pub(super) fn quiet(&mut self, now: Instant, clock: impl Fn(EndpointId) -> Clock) -> Vec<Received> {
+    pub(super) fn quiet(
+        &mut self,
+        now: Instant,
+        clock: impl Fn(EndpointId) -> Clock,
+    ) -> Vec<Received> {
         let passed = |at: Instant| now.saturating_duration_since(at);
         let is_quiet = |writer: &EndpointId, held: &mut Held| {
-            passed(held.since) >= LONGEST || (passed(held.newest) >= QUIET && clock(*writer) != Clock::Awaited)
+            passed(held.since) >= LONGEST
+                || (passed(held.newest) >= QUIET && clock(*writer) != Clock::Awaited)
         };
         let quiet = self.writers.extract_if(is_quiet);
-        quiet
-            .flat_map(|(writer, held)| held.aged(clock(writer).behind_ns()))
-            .collect()
+        quiet.flat_map(|(writer, held)| held.aged(clock(writer).behind_ns())).collect()
     }
 }
 
@@ -108,10 +121,8 @@ mod tests {
     use super::*;
 
     fn received(at: Instant, sequence: u64, depth: u32) -> Received {
-        let header = Header {
-            depth,
-            ..Header::new("t", Origin::default(), WriterId([1; 16]), sequence, 0)
-        };
+        let header =
+            Header { depth, ..Header::new("t", Origin::default(), WriterId([1; 16]), sequence, 0) };
         Received::live(Content::Frame(Frame::new(&header, Bytes::new()).unwrap()), at)
     }
 
@@ -186,10 +197,7 @@ mod tests {
         assert_eq!(ages_ms(&history.quiet(now + QUIET, |_| Clock::Unknown)), [3_000, 0]);
         hold(&mut history, Clock::Unknown);
         let live = moment(9_500 - HOUR, 9_501, Clock::Unknown);
-        assert_eq!(
-            ages_ms(&history.of_writer([1; 16], Some(live.lag_ns()))),
-            [7_999, 4_999]
-        );
+        assert_eq!(ages_ms(&history.of_writer([1; 16], Some(live.lag_ns()))), [7_999, 4_999]);
         hold(&mut history, Clock::Awaited);
         assert!(history.quiet(now + QUIET, |_| Clock::Awaited).is_empty());
         let sign = Clock::Behind(HOUR * 1_000_000);

@@ -1,5 +1,5 @@
-//! The thread that owns the participant: it makes writers and readers, watches over RustDDS and over those who have gone,
-//! and builds everything anew when RustDDS dies.
+//! The thread that owns the participant: it makes writers and readers, watches over RustDDS and
+//! over those who have gone, and builds everything anew when RustDDS dies.
 
 use std::net::UdpSocket;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -169,7 +169,11 @@ impl Lifecycle {
     fn give_birth(&mut self, now: Instant) {
         match Generation::start(&self.shared, now) {
             Ok(generation) => {
-                tracing::info!(domain = self.shared.domain, participant = ?generation.participant, "DDS participant started");
+                tracing::info!(
+                    domain = self.shared.domain,
+                    participant = ?generation.participant,
+                    "DDS participant started",
+                );
                 if let Some(weakness) = generation.participant.filter_weakness() {
                     tracing::debug!(weakness, "hostile datagrams may reach RustDDS");
                 }
@@ -180,7 +184,11 @@ impl Lifecycle {
                 }
             }
             Err(error) => {
-                tracing::warn!(domain = self.shared.domain, %error, "DDS participant cannot start, trying again");
+                tracing::warn!(
+                    domain = self.shared.domain,
+                    %error,
+                    "DDS participant cannot start, trying again",
+                );
                 self.shared.set_status(Health::Down, &error.to_string());
                 self.next_attempt = now + RETRY;
             }
@@ -191,15 +199,18 @@ impl Lifecycle {
 /// Topics whose window is full, and since when.
 fn full(slots: &[Arc<Slot>], now: Instant) -> Vec<(&str, Instant)> {
     let since = |slot: &Arc<Slot>| {
-        slot.full_since()
-            .filter(|since| now.saturating_duration_since(*since) >= PRESSURE)
+        slot.full_since().filter(|since| now.saturating_duration_since(*since) >= PRESSURE)
     };
     let full = slots.iter().filter_map(|slot| Some((&*slot.key.topic, since(slot)?)));
     full.collect()
 }
 
 /// Makes the writers and readers that are wanted and missing.
-fn make_missing(shared: &Arc<Shared>, generation: &Generation, now: Instant) -> Result<(), DdsError> {
+fn make_missing(
+    shared: &Arc<Shared>,
+    generation: &Generation,
+    now: Instant,
+) -> Result<(), DdsError> {
     let slots = shared.slots.live();
     for slot in slots.iter().filter(|slot| slot.needs_writer()) {
         generation.fill(shared, slot, now)?;

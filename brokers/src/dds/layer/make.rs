@@ -22,8 +22,8 @@ use crate::dds::farewell::Farewell;
 use crate::dds::participant::prefix_of;
 use crate::dds::writer::participant_of;
 use crate::dds::{
-    DdsError, EndpointWatch, Endpoints, FoundWriter, GuidPrefix, Illness, Participant, ParticipantConfig, Profile,
-    Pulse, Writer, create_error,
+    DdsError, EndpointWatch, Endpoints, FoundWriter, GuidPrefix, Illness, Participant,
+    ParticipantConfig, Profile, Pulse, Writer, create_error,
 };
 
 /// Between two signs of life.
@@ -61,7 +61,8 @@ impl Generation {
         })?;
         let pulse = Pulse::start(&participant)?;
         let profile = Profile::best_effort(SIGNS);
-        let farewell = Farewell::new(shared.address, participant.port()).map_err(create_error("socket"))?;
+        let farewell =
+            Farewell::new(shared.address, participant.port()).map_err(create_error("socket"))?;
         let near = Near::of_interface(shared.address);
         let presence = Arc::new(parking_lot::Mutex::new(Presence::new(near)));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
@@ -116,10 +117,12 @@ impl Generation {
         if is_new {
             // What is taken from now on is new, however long making the reader takes.
             readers.opened = Some(Timestamp::now());
-            readers.reliable = Some(self.participant.raw_reader(&channel.topic, channel.profile(true))?);
+            readers.reliable =
+                Some(self.participant.raw_reader(&channel.topic, channel.profile(true))?);
         }
         if best_effort && readers.best_effort.is_none() {
-            readers.best_effort = Some(self.participant.raw_reader(&channel.topic, channel.profile(false))?);
+            readers.best_effort =
+                Some(self.participant.raw_reader(&channel.topic, channel.profile(false))?);
         } else if !is_new {
             return Ok(());
         }
@@ -128,16 +131,13 @@ impl Generation {
         Ok(())
     }
 
-    /// Tells others that this one lives and reads who else does. Returns whether another one has given this one up.
+    /// Tells others that this one lives and reads who else does. Returns whether another one has
+    /// given this one up.
     pub(super) fn exchange_signs(&mut self, shared: &Shared, now: Instant) -> bool {
         if now >= self.next_sign {
             self.next_sign = now + SIGN;
-            let gone: Vec<String> = self
-                .presence
-                .lock()
-                .gone(now)
-                .map(|prefix| prefix.to_string())
-                .collect();
+            let gone: Vec<String> =
+                self.presence.lock().gone(now).map(|prefix| prefix.to_string()).collect();
             let time_ns = u64::try_from(nanos(Timestamp::now())).unwrap_or(0);
             let sign = json!({ "time_ns": time_ns, "gone": gone });
             self.sign.write(Bytes::from(sign.to_string()));
@@ -181,7 +181,11 @@ impl Generation {
         }
         dead.extend(given_up);
         for prefix in dead {
-            tracing::warn!(participant = %prefix, domain = shared.domain, "a DDS participant is gone without a good-bye");
+            tracing::warn!(
+                participant = %prefix,
+                domain = shared.domain,
+                "a DDS participant is gone without a good-bye",
+            );
             shared.counts.lock().expelled += 1;
             if let Err(error) = self.farewell.say(prefix) {
                 tracing::warn!(%error, "RustDDS cannot be told");
@@ -193,8 +197,7 @@ impl Generation {
     fn refused(&mut self, shared: &Shared) -> Vec<GuidPrefix> {
         let known: HashMap<GuidPrefix, SocketAddr> = self.presence.lock().sockets().collect();
         // Whoever takes its data elsewhere now is asked there.
-        self.probes
-            .retain(|prefix, (socket, _)| known.get(prefix) == Some(&*socket));
+        self.probes.retain(|prefix, (socket, _)| known.get(prefix) == Some(&*socket));
         for (prefix, socket) in known {
             if self.probes.contains_key(&prefix) {
                 continue;

@@ -1,5 +1,6 @@
-//! DDS as the broker of a layer: user topic `a/b` is the DDS topic `bt/a/b`, reserved topics keep their names, and each
-//! sample is one `blaze::v1::Frame` (`brokers/idl/blaze_frame.idl`), readable by any DDS program.
+//! DDS as the broker of a layer: user topic `a/b` is the DDS topic `bt/a/b`, reserved topics keep
+//! their names, and each sample is one `blaze::v1::Frame` (`brokers/idl/blaze_frame.idl`), readable
+//! by any DDS program.
 //!
 //! ```text
 //! publisher ─► outbox ─► sender thread ─► Slot (a DDS writer) ─► RustDDS ─► network
@@ -7,9 +8,10 @@
 //! lifecycle thread: participant, writers, readers; presence of others; builds all anew when RustDDS dies
 //! ```
 //!
-//! There is no server: the broker is up while a participant stands on the interface. A participant that dies without a
-//! good-bye would hold the windows of all reliable writers for as long as its lease; `presence` finds it, and
-//! `farewell` says good-bye in its name, to the own participant only.
+//! There is no server: the broker is up while a participant stands on the interface. A participant
+//! that dies without a good-bye would hold the windows of all reliable writers for as long as its
+//! lease; `presence` finds it, and `farewell` says good-bye in its name, to the own participant
+//! only.
 
 mod channel;
 mod deliver;
@@ -41,7 +43,8 @@ use super::DdsError;
 use super::reader::StoppableThread;
 use crate::outbox::{Admission, LanePublisher};
 use crate::port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions,
+    Subscription,
 };
 use crate::worker_side::WorkerSide;
 use send::Target;
@@ -52,8 +55,8 @@ pub use shared::MAX_QUEUE_BYTES;
 
 /// How long closing delivers what was taken.
 const DRAIN: Duration = Duration::from_secs(1);
-/// How long readers have to take what they have acknowledged, before its writer goes: RustDDS forgets what was not read of
-/// a writer that has gone.
+/// How long readers have to take what they have acknowledged, before its writer goes: RustDDS
+/// forgets what was not read of a writer that has gone.
 const LINGER: Duration = Duration::from_millis(150);
 /// How long a message may wait for RustDDS.
 const LONGEST_WAIT: Duration = Duration::from_secs(5);
@@ -90,8 +93,8 @@ impl DdsBroker {
         super::check(section.domain, IpAddr::V4(section.interface)).map(|_| ())
     }
 
-    /// Starts in the background: the status tells how far it is. An interface that is missing is no error: it is looked
-    /// for each second.
+    /// Starts in the background: the status tells how far it is. An interface that is missing is no
+    /// error: it is looked for each second.
     ///
     /// # Errors
     /// [`DdsError`] where it can never work, or there is no thread for it.
@@ -132,11 +135,7 @@ impl DdsBroker {
         if self.is_closing() {
             return Err(BrokerError::Closed);
         }
-        if self.shared.is_up() {
-            Ok(())
-        } else {
-            Err(self.shared.away())
-        }
+        if self.shared.is_up() { Ok(()) } else { Err(self.shared.away()) }
     }
 }
 
@@ -150,23 +149,28 @@ impl Broker for DdsBroker {
         self.shared.status.subscribe()
     }
 
-    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError> {
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError> {
         if self.is_closing() {
             return Err(BrokerError::Closed);
         }
         let target = Target::new(&self.shared, names::topic(channel), options);
-        let longest_wait = if options.reliable || options.depth > 0 {
-            RELIABLE_WAIT
-        } else {
-            LONGEST_WAIT
-        };
+        let longest_wait =
+            if options.reliable || options.depth > 0 { RELIABLE_WAIT } else { LONGEST_WAIT };
         Ok(Arc::new(DdsPublisher {
             lane: self.shared.outbox.lane(target, Some(longest_wait)),
             admission: Arc::clone(&self.shared),
         }))
     }
 
-    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
         self.check_up()?;
         let (sender, subscription) = crate::port::subscription(options);
         let made = self.shared.channels.add(channel, sender, options)?;
@@ -188,7 +192,10 @@ impl Broker for DdsBroker {
         }
         let until = Instant::now() + DRAIN;
         let up = || self.shared.is_up();
-        while up() && Instant::now() < until && !(self.shared.is_drained() && self.shared.slots.are_acknowledged()) {
+        while up()
+            && Instant::now() < until
+            && !(self.shared.is_drained() && self.shared.slots.are_acknowledged())
+        {
             tokio::time::sleep(LOOK).await;
         }
         if up() {

@@ -1,7 +1,8 @@
 //! Which addresses of another participant mean here what they mean there.
 //!
-//! A DDS program that is not told otherwise announces the addresses of all its interfaces. Its loopback, the bridge of its
-//! containers or the network inside its robot are somebody else's addresses here, or our own.
+//! A DDS program that is not told otherwise announces the addresses of all its interfaces. Its
+//! loopback, the bridge of its containers or the network inside its robot are somebody else's
+//! addresses here, or our own.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -21,7 +22,8 @@ impl Near {
         Self { address, mask }
     }
 
-    /// The network of the interface that has an address. Where the system does not tell it is that address alone.
+    /// The network of the interface that has an address. Where the system does not tell it is that
+    /// address alone.
     pub(super) fn of_interface(address: Ipv4Addr) -> Self {
         let has_it = |interface: &InterfaceAddress| ipv4(interface.address) == Some(address);
         let interface = getifaddrs().ok().and_then(|mut interfaces| interfaces.find(has_it));
@@ -29,20 +31,21 @@ impl Near {
         Self::new(address, mask.unwrap_or(Ipv4Addr::BROADCAST))
     }
 
-    /// Of a participant's addresses those in the own network. Where there is none, because a router is between, all but
-    /// those that certainly mean something else here.
+    /// Of a participant's addresses those in the own network. Where there is none, because a router
+    /// is between, all but those that certainly mean something else here.
     pub(super) fn select(self, sockets: &BTreeSet<SocketAddr>) -> BTreeSet<SocketAddr> {
         let possible = |socket: &&SocketAddr| {
             let ip = socket.ip();
             ip.is_ipv4() && !ip.is_unspecified() && ip.is_loopback() == self.address.is_loopback()
         };
         let possible: BTreeSet<SocketAddr> = sockets.iter().filter(possible).copied().collect();
-        let own: BTreeSet<SocketAddr> = possible.iter().filter(|socket| self.has(**socket)).copied().collect();
+        let own: BTreeSet<SocketAddr> =
+            possible.iter().filter(|socket| self.has(**socket)).copied().collect();
         if own.is_empty() { possible } else { own }
     }
 
-    /// Where a participant certainly takes its data, of what [`select`](Self::select) gave: an address in the own network,
-    /// or the only one that it has.
+    /// Where a participant certainly takes its data, of what [`select`](Self::select) gave: an
+    /// address in the own network, or the only one that it has.
     pub(super) fn certain(self, selected: &BTreeSet<SocketAddr>) -> Option<SocketAddr> {
         let first = *selected.first()?;
         (selected.len() == 1 || self.has(first)).then_some(first)
@@ -62,18 +65,15 @@ fn ipv4(address: Option<SockaddrStorage>) -> Option<Ipv4Addr> {
 mod tests {
     use super::*;
 
-    const HERE: Near = Near {
-        address: Ipv4Addr::new(192, 168, 1, 4),
-        mask: Ipv4Addr::new(255, 255, 255, 0),
-    };
+    const HERE: Near =
+        Near { address: Ipv4Addr::new(192, 168, 1, 4), mask: Ipv4Addr::new(255, 255, 255, 0) };
 
     fn sockets(addresses: &[&str]) -> BTreeSet<SocketAddr> {
         addresses.iter().map(|address| address.parse().unwrap()).collect()
     }
 
     fn certain(near: Near, addresses: &[&str]) -> Option<String> {
-        near.certain(&near.select(&sockets(addresses)))
-            .map(|socket| socket.to_string())
+        near.certain(&near.select(&sockets(addresses))).map(|socket| socket.to_string())
     }
 
     #[test]

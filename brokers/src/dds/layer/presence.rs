@@ -47,17 +47,13 @@ pub(super) struct Presence {
 
 impl Presence {
     pub(super) fn new(near: Near) -> Self {
-        Self {
-            near,
-            peers: BTreeMap::new(),
-            next: 0,
-            gone: VecDeque::new(),
-        }
+        Self { near, peers: BTreeMap::new(), next: 0, gone: VecDeque::new() }
     }
 
     /// Takes over which readers there are.
     pub(super) fn set_readers(&mut self, readers: &[FoundReader]) {
-        let mut found: BTreeMap<GuidPrefix, (BTreeSet<SocketAddr>, BTreeSet<String>)> = BTreeMap::new();
+        let mut found: BTreeMap<GuidPrefix, (BTreeSet<SocketAddr>, BTreeSet<String>)> =
+            BTreeMap::new();
         for reader in readers {
             let (sockets, topics) = found.entry(reader.participant).or_default();
             sockets.extend(reader.sockets.iter().copied());
@@ -73,12 +69,7 @@ impl Presence {
                 peer.acknowledges = acknowledges;
             } else if self.peers.len() < MAX_PEERS {
                 self.next += 1;
-                let peer = Peer {
-                    number: self.next,
-                    sockets,
-                    acknowledges,
-                    last_sign: None,
-                };
+                let peer = Peer { number: self.next, sockets, acknowledges, last_sign: None };
                 self.peers.insert(prefix, peer);
             }
         }
@@ -110,8 +101,8 @@ impl Presence {
             .filter_map(move |(prefix, peer)| Some((*prefix, near.certain(&peer.sockets)?)))
     }
 
-    /// Those whose port a newer one has. One that shares but some addresses with others is another host's, or has one of
-    /// its own beside theirs.
+    /// Those whose port a newer one has. One that shares but some addresses with others is another
+    /// host's, or has one of its own beside theirs.
     pub(super) fn superseded(&self) -> Vec<GuidPrefix> {
         let mut newest: HashMap<SocketAddr, u64> = HashMap::new();
         for peer in self.peers.values() {
@@ -129,7 +120,8 @@ impl Presence {
         old.map(|(prefix, _)| *prefix).collect()
     }
 
-    /// Those that are given up, since the windows of some topics have been full: each topic and since when.
+    /// Those that are given up, since the windows of some topics have been full: each topic and
+    /// since when.
     pub(super) fn given_up(&self, now: Instant, full: &[(&str, Instant)]) -> Vec<GuidPrefix> {
         if full.is_empty() {
             return Vec::new();
@@ -148,8 +140,7 @@ impl Presence {
 
     /// Remembers one that was given up and may come back.
     pub(super) fn note_gone(&mut self, now: Instant, prefix: GuidPrefix) {
-        self.gone
-            .retain(|(gone, at)| *gone != prefix && now.saturating_duration_since(*at) < TELL);
+        self.gone.retain(|(gone, at)| *gone != prefix && now.saturating_duration_since(*at) < TELL);
         if self.gone.len() >= MAX_GONE {
             self.gone.pop_front();
         }
@@ -173,12 +164,18 @@ pub(super) struct Clocks {
 const COMPARE_EVERY: Duration = Duration::from_secs(5);
 
 impl Clocks {
-    /// Takes a time of day that was sent, and ours when it came. The less of it was spent on the way, the better.
-    pub(super) fn compare(&mut self, now: Instant, prefix: GuidPrefix, sent_ns: i128, received_ns: i128) {
+    /// Takes a time of day that was sent, and ours when it came. The less of it was spent on the
+    /// way, the better.
+    pub(super) fn compare(
+        &mut self,
+        now: Instant,
+        prefix: GuidPrefix,
+        sent_ns: i128,
+        received_ns: i128,
+    ) {
         let behind = received_ns - sent_ns;
         if self.behind.len() >= MAX_PEERS && !self.behind.contains_key(&prefix) {
-            self.behind
-                .retain(|_, (_, at)| now.saturating_duration_since(*at) < 2 * COMPARE_EVERY);
+            self.behind.retain(|_, (_, at)| now.saturating_duration_since(*at) < 2 * COMPARE_EVERY);
             if self.behind.len() >= MAX_PEERS {
                 return;
             }
@@ -248,10 +245,7 @@ mod tests {
     /// Announced by a program in the second slot that uses all its interfaces.
     fn everywhere(addresses: &[[u8; 4]]) -> Vec<SocketAddr> {
         let all = [[127, 0, 0, 1], [172, 17, 0, 1], [10, 42, 0, 1]];
-        all.iter()
-            .chain(addresses)
-            .map(|address| SocketAddr::from((*address, 7413)))
-            .collect()
+        all.iter().chain(addresses).map(|address| SocketAddr::from((*address, 7413))).collect()
     }
 
     #[test]
@@ -298,7 +292,8 @@ mod tests {
         let hosts = [[192, 168, 1, 5], [192, 168, 1, 6]].map(|address| everywhere(&[address]));
         let [first, second] = &hosts;
         presence.set_readers(&[reader_at(1, "a", first.clone())]);
-        presence.set_readers(&[reader_at(1, "a", first.clone()), reader_at(2, "a", second.clone())]);
+        presence
+            .set_readers(&[reader_at(1, "a", first.clone()), reader_at(2, "a", second.clone())]);
         assert_eq!(presence.superseded(), []);
         let asked: Vec<_> = presence.sockets().map(|(_, socket)| socket.to_string()).collect();
         assert_eq!(asked, ["192.168.1.5:7413", "192.168.1.6:7413"]);

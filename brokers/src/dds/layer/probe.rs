@@ -1,4 +1,5 @@
-//! Whether anything listens where another participant takes its data: the system of its host answers for it.
+//! Whether anything listens where another participant takes its data: the system of its host
+//! answers for it.
 
 use std::io::{self, ErrorKind};
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
@@ -25,8 +26,9 @@ impl Probe {
         // The answer to the last one shows at either call.
         let sent = self.socket.send(&NOTHING);
         let received = self.socket.recv(&mut [0; 1]);
-        let refused =
-            |result: io::Result<usize>| result.is_err_and(|error| error.kind() == ErrorKind::ConnectionRefused);
+        let refused = |result: io::Result<usize>| {
+            result.is_err_and(|error| error.kind() == ErrorKind::ConnectionRefused)
+        };
         refused(sent) | refused(received)
     }
 }

@@ -1,16 +1,18 @@
-//! How far a channel has come with one writer: what it had, what is missing, and where that begins which is written now.
+//! How far a channel has come with one writer: what it had, what is missing, and where that begins
+//! which is written now.
 //!
-//! A plain DDS program sends no signs of life, so its clock is not known, and the time of writing alone does not tell what
-//! it kept for late joiners from what it writes now. But what is kept comes in one go: its times of writing run ahead of
-//! those of its arrival. Once both run alike, or nothing came for a moment, it is written as it comes.
+//! A plain DDS program sends no signs of life, so its clock is not known, and the time of writing
+//! alone does not tell what it kept for late joiners from what it writes now. But what is kept
+//! comes in one go: its times of writing run ahead of those of its arrival. Once both run alike, or
+//! nothing came for a moment, it is written as it comes.
 
 use std::time::Duration;
 
 use super::kept::{LONGEST, QUIET};
 use super::presence::Clock;
 
-/// How much older than the subscription a sample may seem and count as live, since clocks are compared over the network; and
-/// by how much samples must catch up to count as kept.
+/// How much older than the subscription a sample may seem and count as live, since clocks are
+/// compared over the network; and by how much samples must catch up to count as kept.
 const SLACK: Duration = Duration::from_millis(20);
 
 /// Nanoseconds.
@@ -18,7 +20,8 @@ fn ns(duration: Duration) -> i128 {
     i128::try_from(duration.as_nanos()).unwrap_or(i128::MAX)
 }
 
-/// When a sample that its writer keeps for late joiners was written, came, and was taken; nanoseconds since 1970.
+/// When a sample that its writer keeps for late joiners was written, came, and was taken;
+/// nanoseconds since 1970.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Moment {
     /// By the clock of its writer.
@@ -41,8 +44,8 @@ impl Moment {
         u64::try_from(age_ns.max(0) / 1_000).unwrap_or(u64::MAX)
     }
 
-    /// Whether it was written before the channel was read. Where the clock is not known it is taken at its word when it says
-    /// that it was not; else `seen` tells.
+    /// Whether it was written before the channel was read. Where the clock is not known it is taken
+    /// at its word when it says that it was not; else `seen` tells.
     pub(super) fn is_old(self, opened_ns: i128, own: bool, seen: &mut Seen) -> bool {
         let slack = if own { 0 } else { ns(SLACK) };
         if let Some(behind_ns) = self.clock.behind_ns() {
@@ -84,12 +87,14 @@ struct Beginning {
 }
 
 impl Seen {
-    /// Takes a sample. `None`: the channel had it. Else how many of this writer, between the last one and this, never came.
+    /// Takes a sample. `None`: the channel had it. Else how many of this writer, between the last
+    /// one and this, never came.
     pub(super) fn take(&mut self, sequence: i64, since_opened: bool) -> Option<u64> {
         let missing = match self.last {
             Some(last) if sequence <= last => return None,
             Some(last) if self.since_opened => sequence.saturating_sub(last).saturating_sub(1),
-            // RustDDS may hold samples of readers before, and of a late joiner's writer what came before is not known.
+            // RustDDS may hold samples of readers before, and of a late joiner's writer what came
+            // before is not known.
             _ => 0,
         };
         self.last = Some(sequence);
@@ -97,7 +102,8 @@ impl Seen {
         Some(u64::try_from(missing).unwrap_or(0))
     }
 
-    /// Takes the times of a sample whose writer's clock is not known. Returns whether it may be one that was kept.
+    /// Takes the times of a sample whose writer's clock is not known. Returns whether it may be one
+    /// that was kept.
     pub(super) fn may_be_kept(&mut self, received_ns: i128, written_ns: i128) -> bool {
         let lag_ns = received_ns - written_ns;
         let beginning = match &mut self.phase {
@@ -118,11 +124,13 @@ impl Seen {
             beginning.least_lag_ns = lag_ns;
             beginning.fell_ns = received_ns;
         }
-        // What is written now came in the shortest time of all; what was kept and had to be repaired did not.
+        // What is written now came in the shortest time of all; what was kept and had to be
+        // repaired did not.
         let came_at_once = lag_ns <= beginning.least_lag_ns + ns(SLACK);
         let goes = passed(beginning.newest_ns, QUIET) || passed(beginning.fell_ns, QUIET);
         // Our own clock may be set back meanwhile.
-        let is_over = passed(beginning.first_ns, LONGEST) || received_ns + ns(LONGEST) < beginning.first_ns;
+        let is_over =
+            passed(beginning.first_ns, LONGEST) || received_ns + ns(LONGEST) < beginning.first_ns;
         let ends = is_over || (came_at_once && goes);
         beginning.newest_ns = received_ns.max(beginning.newest_ns);
         if ends {
@@ -139,8 +147,8 @@ mod tests {
     const MS: i128 = 1_000_000;
     const HOUR: i128 = 3_600_000 * MS;
 
-    /// Which of the samples of a writer, whose clock is an hour behind, may have been kept: each is when it was received
-    /// and really written, in milliseconds.
+    /// Which of the samples of a writer, whose clock is an hour behind, may have been kept: each is
+    /// when it was received and really written, in milliseconds.
     fn may_be_kept(samples: impl IntoIterator<Item = (i128, i128)>) -> Vec<bool> {
         let mut seen = Seen::default();
         samples
@@ -153,11 +161,7 @@ mod tests {
     fn what_is_missing_is_counted_from_the_first_sample_since_the_channel_is_read() {
         let mut seen = Seen::default();
         assert_eq!(seen.take(500, false), Some(0));
-        assert_eq!(
-            seen.take(900, true),
-            Some(0),
-            "what a reader before has left does not count"
-        );
+        assert_eq!(seen.take(900, true), Some(0), "what a reader before has left does not count");
         assert_eq!(seen.take(901, true), Some(0));
         assert_eq!(seen.take(901, true), None);
         assert_eq!(seen.take(900, true), None);
@@ -179,7 +183,8 @@ mod tests {
 
     #[test]
     fn what_is_kept_may_take_longer_than_a_moment() {
-        // A hundred of the last ten seconds come within one; what is written meanwhile follows at 20 Hz.
+        // A hundred of the last ten seconds come within one; what is written meanwhile follows at
+        // 20 Hz.
         let kept = (0..100).map(|number| (10_000 + 10 * number, 100 * number));
         let live = (0..20).map(|number| (11_000 + 50 * number, 11_000 + 50 * number));
         let found = may_be_kept(kept.chain(live));
@@ -189,7 +194,8 @@ mod tests {
 
     #[test]
     fn what_is_kept_and_had_to_be_repaired_is_no_less_old() {
-        // Ten of the last second at once, but one of them a second later. It is delivered in its turn.
+        // Ten of the last second at once, but one of them a second later. It is delivered in its
+        // turn.
         let received = |number: i128| if number == 3 { 11_000 } else { 10_000 + number };
         let found = may_be_kept((0..10).map(|number| (received(number), 100 * number)));
         assert_eq!(found, [true; 10]);
@@ -232,16 +238,15 @@ mod tests {
         let mut seen = Seen::default();
         let own = moment(9_999, 10_001, Clock::Behind(0));
         assert!(own.is_old(10_000 * MS, true, &mut seen));
-        assert!(
-            !own.is_old(10_000 * MS, false, &mut seen),
-            "clocks are compared over the network"
-        );
+        assert!(!own.is_old(10_000 * MS, false, &mut seen), "clocks are compared over the network");
     }
 
     #[test]
     fn a_plain_program_whose_clock_is_behind_is_not_old_for_ever() {
         let hour = 3_600_000;
-        let stream = (0..100).map(|number| moment(11_000 + 20 * number - hour, 11_000 + 20 * number, Clock::Unknown));
+        let stream = (0..100).map(|number| {
+            moment(11_000 + 20 * number - hour, 11_000 + 20 * number, Clock::Unknown)
+        });
         let found = are_old(stream);
         assert!(found[..8].iter().all(|old| *old), "it may be what was kept: {found:?}");
         assert!(found[8..].iter().all(|old| !*old), "{found:?}");
@@ -279,10 +284,7 @@ mod tests {
 
     #[test]
     fn age_is_that_of_the_taking() {
-        let late = Moment {
-            taken_ns: 15_000 * MS,
-            ..moment(9_000, 11_000, Clock::Unknown)
-        };
+        let late = Moment { taken_ns: 15_000 * MS, ..moment(9_000, 11_000, Clock::Unknown) };
         assert_eq!(late.age_us(0), 6_000_000);
         assert_eq!(late.age_us(late.lag_ns()), 4_000_000);
         assert_eq!(late.age_us(7_000 * MS), 0);

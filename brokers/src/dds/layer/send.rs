@@ -26,8 +26,9 @@ use crate::wake::unpark_waker;
 /// Messages and bytes of one turn; one message always fits.
 const TURN_MESSAGES: usize = 64;
 const TURN_BYTES: usize = 256 * 1024;
-/// A full turn takes at least this long: RustDDS neither paces nor tells when it is behind, and what it sends at once must
-/// fit into the buffers of sockets and readers. So up to 32,000 messages and 128 MB per second.
+/// A full turn takes at least this long: RustDDS neither paces nor tells when it is behind, and
+/// what it sends at once must fit into the buffers of sockets and readers. So up to 32,000 messages
+/// and 128 MB per second.
 const TURN: Duration = Duration::from_millis(2);
 /// Between attempts to write what a writer could not take.
 const AGAIN: Duration = Duration::from_millis(2);
@@ -38,7 +39,8 @@ const LARGE_BYTES: usize = 64 * 1024;
 const LARGE_COST: usize = 64 * 1024;
 /// How often what is over its time is looked for while nothing else happens.
 const IDLE: Duration = Duration::from_millis(100);
-/// Origins of one transient_local publisher that have a writer each; the one that wrote longest ago gives way.
+/// Origins of one transient_local publisher that have a writer each; the one that wrote longest ago
+/// gives way.
 const MAX_ORIGINS: usize = 256;
 /// Most samples that are kept per origin.
 const MAX_DEPTH: u32 = 1024;
@@ -70,15 +72,11 @@ impl Target {
         }
     }
 
-    /// One writer for all that is published, which keeps the last `depth` for late joiners, whoever wrote them.
+    /// One writer for all that is published, which keeps the last `depth` for late joiners, whoever
+    /// wrote them.
     pub(super) fn keeping(shared: &Arc<Shared>, topic: Arc<str>, depth: u32) -> Self {
-        let key = SlotKey {
-            topic,
-            reliable: true,
-            large: false,
-            depth: depth_of(depth),
-            origin: None,
-        };
+        let key =
+            SlotKey { topic, reliable: true, large: false, depth: depth_of(depth), origin: None };
         Self::with_writer(shared, key)
     }
 
@@ -105,10 +103,7 @@ impl Target {
         };
         let Some(origin) = origin else {
             // Without an origin there is nothing to keep for late joiners.
-            return shared.slots.get(SlotKey {
-                depth: 0,
-                ..self.key.clone()
-            });
+            return shared.slots.get(SlotKey { depth: 0, ..self.key.clone() });
         };
         let mut origins = self.origins.lock();
         if let Some(slot) = origins.get(&origin) {
@@ -117,10 +112,7 @@ impl Target {
         if origins.len() >= MAX_ORIGINS {
             origins.pop_lru();
         }
-        let slot = shared.slots.get(SlotKey {
-            origin: Some(origin),
-            ..self.key.clone()
-        });
+        let slot = shared.slots.get(SlotKey { origin: Some(origin), ..self.key.clone() });
         origins.put(origin, Arc::clone(&slot));
         shared.wake_lifecycle();
         slot
@@ -135,11 +127,8 @@ pub(super) fn start(shared: &Arc<Shared>) -> Result<StoppableThread, DdsError> {
     let shared = Arc::clone(shared);
     let failed = Arc::<AtomicBool>::default();
     StoppableThread::start("dds-send", failed, move |stop| {
-        let mut sender = Sender {
-            shared,
-            held: HashMap::new(),
-            taken: Vec::with_capacity(TURN_MESSAGES),
-        };
+        let mut sender =
+            Sender { shared, held: HashMap::new(), taken: Vec::with_capacity(TURN_MESSAGES) };
         while !stop.load(Ordering::Relaxed) && !sender.shared.stop.load(Ordering::Acquire) {
             sender.turn();
         }
@@ -198,12 +187,10 @@ impl Sender {
             wait(self.shared.outbox.filled(), IDLE);
             return;
         }
-        let is_large = |queue: &VecDeque<Waiting<Target>>| queue.front().is_some_and(|it| it.size() > LARGE_BYTES);
-        let pause = if self.held.values().all(is_large) {
-            LARGE_AGAIN
-        } else {
-            AGAIN
+        let is_large = |queue: &VecDeque<Waiting<Target>>| {
+            queue.front().is_some_and(|it| it.size() > LARGE_BYTES)
         };
+        let pause = if self.held.values().all(is_large) { LARGE_AGAIN } else { AGAIN };
         // What is published meanwhile may go to another writer.
         wait(self.shared.outbox.filled(), pause);
     }
@@ -254,9 +241,7 @@ fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<F
     match slot.write(now, || octets(waiting, now)) {
         Attempt::Done => {
             let is_reserved = !slot.key.topic.starts_with(names::USER_PREFIX);
-            shared
-                .channels
-                .deliver_own(&slot.key.topic, || content(waiting, now, is_reserved));
+            shared.channels.deliver_own(&slot.key.topic, || content(waiting, now, is_reserved));
             Some(Fate::Delivered)
         }
         Attempt::Failed => Some(Fate::Dropped(DropReason::BrokerError)),

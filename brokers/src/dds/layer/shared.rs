@@ -122,16 +122,21 @@ impl Shared {
         let status = self.status.borrow();
         match status.health {
             Health::Closed => BrokerError::Closed,
-            Health::Connecting | Health::Up | Health::Down | Health::InUse => BrokerError::Away(status.detail.clone()),
+            Health::Connecting | Health::Up | Health::Down | Health::InUse => {
+                BrokerError::Away(status.detail.clone())
+            }
         }
     }
 
-    /// Whether what is published is dropped at once. While it starts for the first time or is built anew, messages wait.
+    /// Whether what is published is dropped at once. While it starts for the first time or is built
+    /// anew, messages wait.
     pub(super) fn is_down(&self) -> bool {
         let status = self.status.borrow();
         match status.health {
             Health::Closed => true,
-            Health::Down => !self.was_up.load(Ordering::Relaxed) || status.since.elapsed() > REBUILD,
+            Health::Down => {
+                !self.was_up.load(Ordering::Relaxed) || status.since.elapsed() > REBUILD
+            }
             Health::Connecting | Health::Up | Health::InUse => false,
         }
     }

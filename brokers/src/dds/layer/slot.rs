@@ -1,4 +1,5 @@
-//! DDS writers of topics: made by the lifecycle thread, written by the sender, gone a while after their last user.
+//! DDS writers of topics: made by the lifecycle thread, written by the sender, gone a while after
+//! their last user.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -13,9 +14,11 @@ use crate::dds::{Profile, Writer, Written};
 
 /// How long a new writer waits for its first reader: discovery takes that long where there is one.
 const MEET: Duration = Duration::from_millis(300);
-/// How long after the first reader was found samples may not reach it, since it has not found the writer.
+/// How long after the first reader was found samples may not reach it, since it has not found the
+/// writer.
 const SETTLE: Duration = Duration::from_millis(20);
-/// How long a writer stays after its last user at least, and at most while readers have not acknowledged.
+/// How long a writer stays after its last user at least, and at most while readers have not
+/// acknowledged.
 const LINGER: Duration = Duration::from_millis(300);
 const LONGEST_LINGER: Duration = Duration::from_secs(5);
 
@@ -43,11 +46,8 @@ pub(super) struct SlotKey {
 impl SlotKey {
     /// What its writer offers.
     pub(super) fn profile(&self) -> Profile {
-        let (depth, window) = if self.large {
-            (LARGE_DEPTH, LARGE_WINDOW)
-        } else {
-            (SMALL_DEPTH, SMALL_WINDOW)
-        };
+        let (depth, window) =
+            if self.large { (LARGE_DEPTH, LARGE_WINDOW) } else { (SMALL_DEPTH, SMALL_WINDOW) };
         Profile {
             reliable: self.reliable,
             depth: if self.depth > 0 { self.depth } else { depth },
@@ -105,7 +105,9 @@ impl Slot {
             return Attempt::NotNow;
         };
         if !state.settled {
-            let age = |at: Option<Instant>| at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
+            let age = |at: Option<Instant>| {
+                at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at))
+            };
             if state.matched.is_none() && writer.is_matched() {
                 state.matched = Some(now);
             }
@@ -133,11 +135,8 @@ impl Slot {
     }
 
     pub(super) fn put(&self, writer: Writer, now: Instant) {
-        *self.state.lock() = State {
-            writer: Some(Arc::new(writer)),
-            made: Some(now),
-            ..State::default()
-        };
+        *self.state.lock() =
+            State { writer: Some(Arc::new(writer)), made: Some(now), ..State::default() };
     }
 
     /// Since when its window has been full.
@@ -208,10 +207,8 @@ impl Slots {
     /// Takes out all writers, whose participant has died.
     pub(super) fn take_all(&self) -> Vec<Arc<Writer>> {
         let live = self.live();
-        let mut writers: Vec<Arc<Writer>> = live
-            .iter()
-            .filter_map(|slot| std::mem::take(&mut *slot.state.lock()).writer)
-            .collect();
+        let mut writers: Vec<Arc<Writer>> =
+            live.iter().filter_map(|slot| std::mem::take(&mut *slot.state.lock()).writer).collect();
         writers.extend(self.retired.0.lock().drain(..).map(|(writer, _)| writer));
         writers
     }

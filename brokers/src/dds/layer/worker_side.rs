@@ -1,5 +1,6 @@
-//! What a worker of BlazeConfig does on DDS, beside messages: writers that stand before anybody listens, and keep the last
-//! notices of their topic for those who come later. There are no keys: what is old gives way to what is new.
+//! What a worker of BlazeConfig does on DDS, beside messages: writers that stand before anybody
+//! listens, and keep the last notices of their topic for those who come later. There are no keys:
+//! what is old gives way to what is new.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -26,10 +27,7 @@ pub(super) struct DdsWorkerSide {
 
 impl DdsWorkerSide {
     pub(super) fn new(shared: &Arc<Shared>) -> Self {
-        Self {
-            shared: Arc::clone(shared),
-            prepared: Mutex::default(),
-        }
+        Self { shared: Arc::clone(shared), prepared: Mutex::default() }
     }
 
     fn write_one(&self, message: &KeyedMessage) -> Result<(), WriteError> {
@@ -45,10 +43,9 @@ impl DdsWorkerSide {
         match publisher.publish_bare(value, None) {
             PublishOutcome::Taken => Ok(()),
             PublishOutcome::Dropped => Err(self.shared.away().into()),
-            PublishOutcome::TooLarge => Err(WriteError::TooLarge {
-                channel: message.channel.clone(),
-                bytes: value.len(),
-            }),
+            PublishOutcome::TooLarge => {
+                Err(WriteError::TooLarge { channel: message.channel.clone(), bytes: value.len() })
+            }
         }
     }
 }
@@ -76,7 +73,8 @@ impl WorkerSide for DdsWorkerSide {
         self.prepared.lock().remove(channel);
     }
 
-    /// RustDDS does not tell which readers have a sample: one counts as written when it waits to be sent.
+    /// RustDDS does not tell which readers have a sample: one counts as written when it waits to be
+    /// sent.
     async fn write(&self, messages: &[KeyedMessage]) -> Result<(), WriteError> {
         if !self.shared.is_up() {
             return Err(self.shared.away().into());

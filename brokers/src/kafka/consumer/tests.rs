@@ -1,4 +1,5 @@
-//! Against the server that the client library simulates. The test hands out in place of the thread, one record at a time.
+//! Against the server that the client library simulates. The test hands out in place of the thread,
+//! one record at a time.
 
 use std::future::Future as _;
 use std::pin::pin;
@@ -16,10 +17,7 @@ use crate::kafka::settings::tests::shared_at;
 use crate::port::{SubscribeOptions, Subscription, subscription};
 
 const TOPIC: &str = "fog.imu.data";
-const INFO: TopicInfo = TopicInfo {
-    uuid: None,
-    partitions: 1,
-};
+const INFO: TopicInfo = TopicInfo { uuid: None, partitions: 1 };
 
 struct Bench {
     consumer: Consumer,
@@ -51,10 +49,8 @@ impl Bench {
         let server = MockCluster::new(1).unwrap();
         server.create_topic(TOPIC, 1, 1).unwrap();
         let bootstrap = server.bootstrap_servers();
-        let producer: BaseProducer = ClientConfig::new()
-            .set("bootstrap.servers", &bootstrap)
-            .create()
-            .unwrap();
+        let producer: BaseProducer =
+            ClientConfig::new().set("bootstrap.servers", &bootstrap).create().unwrap();
         for _ in 0..records {
             let record = BaseRecord::<(), str>::to(TOPIC).partition(0).payload("bare");
             producer.send(record).map_err(|(error, _)| error).unwrap();
@@ -64,24 +60,15 @@ impl Bench {
         let channel = ChannelName::from(&"imu/data".parse::<TopicName>().unwrap());
         Self {
             consumer,
-            source: Source {
-                channel,
-                topic: TOPIC.into(),
-                stays_open: false,
-            },
+            source: Source { channel, topic: TOPIC.into(), stays_open: false },
             server,
         }
     }
 
     fn add(&self, start: i64, join: Join<'_>) -> Offsets {
         let (sender, subscription) = subscription(SubscribeOptions::default());
-        self.consumer
-            .add(&self.source, &INFO, vec![start], sender, join)
-            .unwrap();
-        Offsets {
-            subscription,
-            got: Vec::new(),
-        }
+        self.consumer.add(&self.source, &INFO, vec![start], sender, join).unwrap();
+        Offsets { subscription, got: Vec::new() }
     }
 
     /// Hands records out until a reader has got the one at `last`.
@@ -102,10 +89,8 @@ impl Bench {
 
     /// As if the server had said so of the topic.
     fn follow(&self, now: Instant, marks: Marks, lost_position: bool) {
-        let info = TopicInfo {
-            uuid: self.consumer.state.lock().topics[TOPIC].uuid.clone(),
-            ..INFO
-        };
+        let info =
+            TopicInfo { uuid: self.consumer.state.lock().topics[TOPIC].uuid.clone(), ..INFO };
         self.consumer.follow(now, TOPIC, (&info, &[marks]), lost_position);
     }
 }
@@ -121,11 +106,7 @@ fn readers_that_come_while_records_flow_get_each_once_and_in_order() {
     }
     for (reader, start) in readers.iter_mut().zip([0, 3, 9, 15]) {
         bench.hand_out_until(reader, 39);
-        assert!(
-            reader.take().iter().copied().eq(start..40),
-            "from {start}: {:?}",
-            reader.got
-        );
+        assert!(reader.take().iter().copied().eq(start..40), "from {start}: {:?}", reader.got);
     }
 }
 
@@ -201,10 +182,7 @@ fn a_topic_that_the_client_did_not_take_is_read_on_where_it_stood() {
 fn a_reader_that_comes_while_the_client_is_made_anew_reads_with_the_new_one() {
     let bench = Bench::new(10);
     let (sender, subscription) = subscription(SubscribeOptions::default());
-    let mut reader = Offsets {
-        subscription,
-        got: Vec::new(),
-    };
+    let mut reader = Offsets { subscription, got: Vec::new() };
     // It waits for an answer about its topic meanwhile.
     bench.server.broker_down(1).unwrap();
     let client = Arc::downgrade(&bench.consumer.client().unwrap());

@@ -15,8 +15,9 @@ use crate::port::SubscriptionSender;
 /// How long a reader may stand still while records wait for it.
 const PATIENCE: Duration = Duration::from_secs(1);
 const MOST_PATIENCE: Duration = Duration::from_secs(60);
-/// A beginning or an end that does not hold what is to be read next is believed after this time: a server that stood still for a moment,
-/// and begins to lead the partition again, names others first. To believe them would be to read the last records twice, or never.
+/// A beginning or an end that does not hold what is to be read next is believed after this time: a
+/// server that stood still for a moment, and begins to lead the partition again, names others
+/// first. To believe them would be to read the last records twice, or never.
 const BELIEVED: Duration = Duration::from_secs(3);
 
 pub(super) struct Partition {
@@ -37,7 +38,8 @@ pub(super) struct Reader {
 pub(super) struct TopicState {
     pub(super) source: Source,
     pub(super) uuid: Option<TopicUuid>,
-    /// None while the topic is not there: all that it will hold came after its readers, so it is read from its beginning.
+    /// None while the topic is not there: all that it will hold came after its readers, so it is
+    /// read from its beginning.
     pub(super) partitions: Vec<Partition>,
     pub(super) readers: Vec<Reader>,
     /// Whether the client reads it now.
@@ -54,8 +56,8 @@ struct Behind {
     positions: Vec<i64>,
     /// Since when.
     since: Instant,
-    /// How long that may last: longer each time that asking again has changed nothing, because what waits may be a mark of
-    /// a transaction, which no reader gets.
+    /// How long that may last: longer each time that asking again has changed nothing, because what
+    /// waits may be a mark of a transaction, which no reader gets.
     patience: Duration,
 }
 
@@ -95,8 +97,8 @@ impl TopicState {
         self.identify(info.uuid.clone(), layer);
     }
 
-    /// It is to be read again. A topic that this flow stood back from begins at its end, because what was written meanwhile
-    /// was another's; one that the client did not take, where it stood.
+    /// It is to be read again. A topic that this flow stood back from begins at its end, because
+    /// what was written meanwhile was another's; one that the client did not take, where it stood.
     pub(super) fn begin(&mut self, info: &TopicInfo, marks: &[Marks], layer: &str) {
         let ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
         if !std::mem::take(&mut self.stood_back) || self.is_awaited() {
@@ -108,7 +110,8 @@ impl TopicState {
         }
     }
 
-    /// A reader that comes begins before what is read next: it is read again from there, and not given to those that had it.
+    /// A reader that comes begins before what is read next: it is read again from there, and not
+    /// given to those that had it.
     pub(super) fn rewind(&mut self, starts: &[i64], client: &Client) {
         if !self.is_beyond(starts) {
             return;
@@ -148,8 +151,9 @@ impl TopicState {
         self.identify(Some(uuid), layer);
     }
 
-    /// Looks whether it stands still although records wait. The client library gives a partition up that had no leader at the
-    /// moment when it was to be read (a topic that was just made, a broker that was fenced); asked again, it goes on.
+    /// Looks whether it stands still although records wait. The client library gives a partition up
+    /// that had no leader at the moment when it was to be read (a topic that was just made, a
+    /// broker that was fenced); asked again, it goes on.
     pub(super) fn watch(&mut self, marks: &[Marks], now: Instant, client: &Client) {
         let waits = self.partitions.iter().zip(marks).any(|(at, mark)| mark.high > at.next);
         if !waits {
@@ -162,22 +166,23 @@ impl TopicState {
                 if now.saturating_duration_since(behind.since) < behind.patience {
                     return;
                 }
-                tracing::warn!(topic = %self.source.topic, ?positions, "records wait and are not read: asking for them again");
+                tracing::warn!(
+                    topic = %self.source.topic,
+                    ?positions,
+                    "records wait and are not read: asking for them again",
+                );
                 behind.since = now;
                 behind.patience = (behind.patience * 2).min(MOST_PATIENCE);
                 self.reassign(client);
             }
             _ => {
-                self.behind = Some(Behind {
-                    positions,
-                    since: now,
-                    patience: PATIENCE,
-                });
+                self.behind = Some(Behind { positions, since: now, patience: PATIENCE });
             }
         }
     }
 
-    /// Moves positions that the server does not have to what is nearest. Returns whether that is not sure yet.
+    /// Moves positions that the server does not have to what is nearest. Returns whether that is
+    /// not sure yet.
     pub(super) fn compare(&mut self, marks: &[Marks], now: Instant, client: &Client) -> bool {
         let mut in_doubt = false;
         for (number, (partition, mark)) in self.partitions.iter_mut().zip(marks).enumerate() {
@@ -192,12 +197,14 @@ impl TopicState {
             }
             let at = partition.next.clamp(mark.low, mark.high.max(mark.low));
             tracing::warn!(
-                topic = %self.source.topic, partition = number, position = partition.next, moved_to = at,
+                topic = %self.source.topic, partition = number, position = partition.next,
+                moved_to = at,
                 "the server no longer has what was to be read next"
             );
             partition.next = at;
         }
-        // Also where nothing moved: the client stops reading a partition whose position it could not find for a moment.
+        // Also where nothing moved: the client stops reading a partition whose position it could
+        // not find for a moment.
         self.reassign(client);
         in_doubt
     }
@@ -220,7 +227,8 @@ impl TopicState {
         Ok(list)
     }
 
-    /// Reads it from now on. Returns whether the client takes that; else it is tried again with the next look.
+    /// Reads it from now on. Returns whether the client takes that; else it is tried again with the
+    /// next look.
     pub(super) fn assign(&mut self, client: &Client) -> bool {
         let done = self.list().and_then(|list| client.incremental_assign(&list));
         if let Err(error) = &done {

@@ -19,8 +19,9 @@ fn until(what: &str, mut holds: impl FnMut() -> bool) {
     }
 }
 
-/// The server stands still until the clients have given up their connections, and then names no broker for a moment. The client
-/// library never finds back from there: without being made anew, each of the three clients would stay without an answer for ever.
+/// The server stands still until the clients have given up their connections, and then names no
+/// broker for a moment. The client library never finds back from there: without being made anew,
+/// each of the three clients would stay without an answer for ever.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_that_named_no_broker_for_a_moment_is_found_again() {
     let server = FakeBroker::start();
@@ -30,12 +31,8 @@ async fn a_server_that_named_no_broker_for_a_moment_is_found_again() {
     until("up at the beginning", || health() == Health::Up);
     let producer = inner.producer(Lot::default()).unwrap();
     let consumer = inner.consumer(false).unwrap();
-    let answered = || {
-        (
-            producer.is_answered(&inner.probe, QUICK),
-            consumer.is_answered(&inner.probe, QUICK),
-        )
-    };
+    let answered =
+        || (producer.is_answered(&inner.probe, QUICK), consumer.is_answered(&inner.probe, QUICK));
     until("reader and writer are answered", || answered() == (true, true));
     for round in 0..3 {
         server.set_silent(true);
@@ -80,16 +77,14 @@ fn a_client_without_an_answer_for_a_while_is_made_anew_and_given_as_long_again()
     assert_eq!(seen, [false, false, true, false, true, false, false, false]);
 }
 
-/// Seen with a server that was killed: its last answer went to the client that asks, and not to the one that writes; 3 s later it was
-/// back, the writer had not yet heard from it, and was made anew as if it had been left alone for those 3 s.
+/// Seen with a server that was killed: its last answer went to the client that asks, and not to the
+/// one that writes; 3 s later it was back, the writer had not yet heard from it, and was made anew
+/// as if it had been left alone for those 3 s.
 #[test]
 fn time_in_which_no_client_is_answered_does_not_count() {
     let start = Instant::now();
-    let clients = [
-        Client::Producer(Lot::default()),
-        Client::Consumer { large: false },
-        Client::Admin,
-    ];
+    let clients =
+        [Client::Producer(Lot::default()), Client::Consumer { large: false }, Client::Admin];
     let mut silent = Silent::default();
     let note = |silent: &mut Silent, at| clients.map(|client| silent.note(client, at, false));
     assert_eq!(note(&mut silent, start), [false; 3]);

@@ -95,9 +95,7 @@ impl WriteContext {
 
     /// A record is no longer with the client: it was delivered, or there is an error.
     pub(in crate::kafka) fn settle(&self, delivery: Delivery, error: Option<&KafkaError>) {
-        let Delivery {
-            topic, bytes, receipt, ..
-        } = delivery;
+        let Delivery { topic, bytes, receipt, .. } = delivery;
         let fate = error.map_or(Fate::Delivered, |error| self.failed(error, &topic));
         match receipt {
             Sent::Message(receipt) => receipt.settle(fate),
@@ -137,7 +135,9 @@ impl WriteContext {
 
 fn reason_of(code: Option<RDKafkaErrorCode>) -> DropReason {
     match code {
-        Some(RDKafkaErrorCode::MessageSizeTooLarge | RDKafkaErrorCode::MessageBatchTooLarge) => DropReason::TooLarge,
+        Some(RDKafkaErrorCode::MessageSizeTooLarge | RDKafkaErrorCode::MessageBatchTooLarge) => {
+            DropReason::TooLarge
+        }
         _ => DropReason::BrokerError,
     }
 }

@@ -14,7 +14,8 @@ use crate::outbox::{Body, Waiting};
 /// How a record gets its key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::kafka) enum Keying {
-    /// Its writer; and its place, where the topic keeps the last `depth` of each. Bare payloads have none.
+    /// Its writer; and its place, where the topic keeps the last `depth` of each. Bare payloads
+    /// have none.
     Writer {
         /// What the topic keeps of each writer.
         depth: u32,
@@ -50,8 +51,9 @@ impl Ready {
                     Keying::Writer { depth } => depth,
                     Keying::AnswerId => 0,
                 };
-                partition =
-                    (depth > 0).then(|| record::partition_of(frame.writer(), target.topic.partitions().unwrap_or(1)));
+                partition = (depth > 0).then(|| {
+                    record::partition_of(frame.writer(), target.topic.partitions().unwrap_or(1))
+                });
                 key = Some(record::key(frame.writer(), frame.sequence(), depth));
                 headers = Some(record::headers(&frame, scratch));
                 payload = frame.payload().clone();
@@ -72,13 +74,7 @@ impl Ready {
             bytes,
             sent,
         });
-        Self {
-            payload,
-            key,
-            partition,
-            headers,
-            delivery,
-        }
+        Self { payload, key, partition, headers, delivery }
     }
 }
 
@@ -86,10 +82,7 @@ impl Ready {
 fn answer_id(payload: &[u8]) -> Option<String> {
     let value: serde_json::Value = serde_json::from_slice(payload).ok()?;
     let answers = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
-    answers
-        .iter()
-        .find_map(|answer| answer.get("id")?.as_str())
-        .map(str::to_owned)
+    answers.iter().find_map(|answer| answer.get("id")?.as_str()).map(str::to_owned)
 }
 
 #[cfg(test)]
@@ -107,11 +100,8 @@ mod tests {
 
     #[test]
     fn the_age_of_a_record_has_what_it_waited_for_the_client() {
-        let outbox = Outbox::new(OutboxLimits {
-            lane_messages: 1,
-            lane_bytes: 10_000,
-            total_bytes: 10_000,
-        });
+        let outbox =
+            Outbox::new(OutboxLimits { lane_messages: 1, lane_bytes: 10_000, total_bytes: 10_000 });
         let (topic, _) = Topics::default().of(&Arc::from("imu.data"), false);
         let keying = Keying::Writer { depth: 0 };
         let lane = outbox.lane(Target { topic, keying }, None);

@@ -17,10 +17,7 @@ fn what_is_being_handed_over_is_not_drained() {
         let name: Arc<str> = "fog.imu.data".into();
         let (topic, _) = topics.of(&name, false);
         topics.note(&std::collections::HashMap::from([(name.to_string(), 1)]), false);
-        let lane = producer.lane(Target {
-            topic,
-            keying: Keying::Writer { depth: 0 },
-        });
+        let lane = producer.lane(Target { topic, keying: Keying::Writer { depth: 0 } });
         assert!(producer.is_drained());
         for _ in 0..MESSAGES {
             let body = Body::Bare(Bytes::from_static(b"bare"));

@@ -36,19 +36,12 @@ fn written(frame: &Frame) -> Vec<(String, Vec<u8>)> {
 
 fn read_pairs(pairs: &[(String, Vec<u8>)], payload: &[u8]) -> Content {
     let headers = pairs.iter().map(|(key, value)| (key.as_str(), Some(value.as_slice())));
-    read(
-        &channel(),
-        headers,
-        Bytes::copy_from_slice(payload),
-        Some((WriterId([9; 16]), 5)),
-    )
+    read(&channel(), headers, Bytes::copy_from_slice(payload), Some((WriterId([9; 16]), 5)))
 }
 
 #[test]
 fn headers_are_as_the_contract_says() {
-    let frame = Frame::new(&full_header(), Bytes::new())
-        .unwrap()
-        .with_hops_and_age(1, 2);
+    let frame = Frame::new(&full_header(), Bytes::new()).unwrap().with_hops_and_age(1, 2);
     let shown: Vec<String> = written(&frame)
         .into_iter()
         .map(|(key, value)| format!("{key}={}", String::from_utf8(value).unwrap()))
@@ -125,10 +118,7 @@ fn broken_headers_are_malformed() {
     without.retain(|(key, _)| key != "blaze-sequence");
     assert!(matches!(read_pairs(&without, b""), Content::Malformed { .. }));
     let null = [("blaze-writer", None)].into_iter();
-    assert!(matches!(
-        read(&channel(), null, Bytes::new(), None),
-        Content::Malformed { .. }
-    ));
+    assert!(matches!(read(&channel(), null, Bytes::new(), None), Content::Malformed { .. }));
 }
 
 #[test]
@@ -147,8 +137,10 @@ fn keys_keep_a_writer_together() {
 fn names() -> impl Strategy<Value = String> {
     prop_oneof![
         8 => prop::sample::select(vec![
-            "blaze-version", "blaze-origin", "blaze-epoch", "blaze-writer", "blaze-sequence", "blaze-time",
-            "blaze-encoding", "blaze-age-us", "blaze-hops", "blaze-lifespan-ms", "blaze-priority", "blaze-reliable",
+            "blaze-version", "blaze-origin", "blaze-epoch", "blaze-writer", "blaze-sequence",
+            "blaze-time",
+            "blaze-encoding", "blaze-age-us", "blaze-hops", "blaze-lifespan-ms", "blaze-priority",
+            "blaze-reliable",
             "blaze-depth", "blaze-type-hash", "traceparent", "blaze-unknown",
         ]).prop_map(str::to_owned),
         1 => ".*",
@@ -167,7 +159,8 @@ fn values() -> impl Strategy<Value = Vec<u8>> {
 
 proptest! {
     #[test]
-    fn hostile_headers_never_panic(pairs in prop::collection::vec((names(), values()), 0..24), payload: Vec<u8>) {
+    fn hostile_headers_never_panic(pairs in prop::collection::vec((names(), values()), 0..24),
+        payload: Vec<u8>) {
         let names_writer = pairs.iter().any(|(key, _)| key == "blaze-writer");
         match read_pairs(&pairs, &payload) {
             Content::Frame(frame) => {
@@ -180,7 +173,9 @@ proptest! {
                 prop_assert_eq!(again.origin(), frame.origin());
             }
             Content::Bare { .. } => prop_assert!(!names_writer),
-            Content::Malformed { bytes, .. } => prop_assert!(names_writer && bytes == payload.len()),
+            Content::Malformed { bytes, .. } => prop_assert!(
+                names_writer && bytes == payload.len(),
+            ),
         }
     }
 

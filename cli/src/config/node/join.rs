@@ -57,7 +57,8 @@ pub(super) async fn run(options: &JoinOptions, format: Format) -> Result<Exit, C
         told(&plan, &document, token, false)
     };
     say(options, &plan, &answer, format);
-    let is_elsewhere = options.node_file.is_some() && plan.place != TokenPlace::Stdout && !options.dry_run;
+    let is_elsewhere =
+        options.node_file.is_some() && plan.place != TokenPlace::Stdout && !options.dry_run;
     if format != Format::Table || !is_elsewhere {
         print(&answer, format, |answer| on_stdout(options, &plan, answer))?;
     }
@@ -71,7 +72,8 @@ fn place(options: &JoinOptions, format: Format) -> Result<TokenPlace, CliError> 
         Some(path) if path.as_os_str() == "-" => {
             if format == Format::Table && options.node_file.is_none() {
                 return Err(CliError::Usage(
-                    "--token-out - puts the token on standard output: give --node-file FILE for the node file, or -o json for both"
+                    "--token-out - puts the token on standard output: give --node-file FILE for \
+                     the node file, or -o json for both"
                         .to_owned(),
                 ));
             }
@@ -110,7 +112,9 @@ async fn prepare(
     let (node_file, notes) = plan::node_file(options, &around)?;
     let node = plan::document(options, existing.as_ref().map(|answer| &answer.body))?;
     let kept = match &place {
-        TokenPlace::File(file) if !options.renew => token_file::inspect(file, options.layer.as_str(), now_ms())?,
+        TokenPlace::File(file) if !options.renew => {
+            token_file::inspect(file, options.layer.as_str(), now_ms())?
+        }
         TokenPlace::File(_) | TokenPlace::Stdout | TokenPlace::None => None,
     };
     if let (TokenPlace::File(file), None) = (&place, &kept) {
@@ -120,34 +124,24 @@ async fn prepare(
         check_node_file(file, &node_file)?;
         token_file::check_writable(file)?;
     }
-    let revision = existing
-        .as_ref()
-        .and_then(|answer| answer.body.get("revision").cloned());
+    let revision = existing.as_ref().and_then(|answer| answer.body.get("revision").cloned());
     let tag = existing.map(|answer| client.tag(&answer, false)).transpose()?;
-    Ok(Plan {
-        key,
-        node,
-        revision,
-        tag,
-        place,
-        kept,
-        node_file,
-        notes,
-    })
+    Ok(Plan { key, node, revision, tag, place, kept, node_file, notes })
 }
 
 /// The kind of the layer. Without the layer there is nothing to join.
 async fn kind_of(options: &JoinOptions, client: &Client) -> Result<String, CliError> {
     let layer = &options.layer;
     let read = client.document(&Key::layer(layer), None).await.map_err(|error| match error {
-        CliError::Problem(refusal) if refusal.code() == "not_found" => CliError::Problem(refusal).advised(format!(
-            "A node joins a layer that is there. Make it first: echo '{{kind: Layer, name: {layer}, spec: {{kind: edge}}}}' | blaze apply -f -"
-        )),
+        CliError::Problem(refusal) if refusal.code() == "not_found" => CliError::Problem(refusal)
+            .advised(format!(
+                "A node joins a layer that is there. Make it first: echo '{{kind: Layer, name: \
+             {layer}, spec: {{kind: edge}}}}' | blaze apply -f -"
+            )),
         other => other,
     })?;
     let kind = read.body.pointer("/spec/kind").and_then(Value::as_str);
-    kind.map(str::to_owned)
-        .ok_or_else(|| client.odd("a layer has no `spec.kind`"))
+    kind.map(str::to_owned).ok_or_else(|| client.odd("a layer has no `spec.kind`"))
 }
 
 /// Makes the document, or changes what was read. What somebody else did in between is a conflict.
@@ -161,7 +155,11 @@ async fn write_document(client: &Client, plan: &Plan) -> Result<Value, CliError>
 }
 
 /// Makes the token and puts it where it goes; gives what may be shown of it.
-async fn make_token(options: &JoinOptions, client: &Client, place: &TokenPlace) -> Result<Option<Value>, CliError> {
+async fn make_token(
+    options: &JoinOptions,
+    client: &Client,
+    place: &TokenPlace,
+) -> Result<Option<Value>, CliError> {
     if *place == TokenPlace::None {
         return Ok(None);
     }
@@ -175,11 +173,14 @@ async fn make_token(options: &JoinOptions, client: &Client, place: &TokenPlace) 
     };
     let made = match options.signing.sign(&wanted)? {
         Some(made) => made,
-        None => ask_for(client, &wanted)
-            .await
-            .map_err(|error| without_token(options, error))?,
+        None => ask_for(client, &wanted).await.map_err(|error| without_token(options, error))?,
     };
-    let mut shown = json!({ "id": made.get("id"), "subject": subject, "layer": options.layer, "expire_time": made.get("expire_time") });
+    let mut shown = json!({
+        "id": made.get("id"),
+        "subject": subject,
+        "layer": options.layer,
+        "expire_time": made.get("expire_time"),
+    });
     let text = made.get("token").and_then(Value::as_str).unwrap_or_default();
     match place {
         TokenPlace::File(file) => token_file::write(file, text).map_err(|error| {
@@ -194,12 +195,17 @@ async fn make_token(options: &JoinOptions, client: &Client, place: &TokenPlace) 
     Ok(Some(shown))
 }
 
-/// What to do where the server gives no token; the node is there by now, so the next run goes on from here.
+/// What to do where the server gives no token; the node is there by now, so the next run goes on
+/// from here.
 fn without_token(options: &JoinOptions, error: CliError) -> CliError {
     let name = &options.name;
-    let signing = matches!(&error, CliError::Problem(refusal) if refusal.code() == "signing_disabled");
+    let signing =
+        matches!(&error, CliError::Problem(refusal) if refusal.code() == "signing_disabled");
     let what = match signing {
-        true => "sign it with --key-file FILE --alg ALG, or give --no-token for a main service that runs with --dev",
+        true => {
+            "sign it with --key-file FILE --alg ALG, or give --no-token for a main service that \
+             runs with --dev"
+        }
         false => "run it again when that is mended",
     };
     error.advised(format!("Node {name} is there, its token is not: {what}."))
@@ -208,17 +214,23 @@ fn without_token(options: &JoinOptions, error: CliError) -> CliError {
 /// A node file that says something else is nobody's to replace.
 fn check_node_file(file: &Path, wanted: &Value) -> Result<(), CliError> {
     let place = file.display();
-    let there = read_small(file).map_err(|error| CliError::Failed(format!("the node file {place}: {error}")))?;
+    let there = read_small(file)
+        .map_err(|error| CliError::Failed(format!("the node file {place}: {error}")))?;
     match there {
-        Some(there) if there != yaml::document(wanted).as_bytes() => Err(CliError::Failed(format!(
-            "{place} is there and says something else: it was left alone, and nothing was changed.\n  Name another file, or compare with what --dry-run prints."
-        ))),
+        Some(there) if there != yaml::document(wanted).as_bytes() => {
+            Err(CliError::Failed(format!(
+                "{place} is there and says something else: it was left alone, and nothing was \
+                 changed.\n  Name another file, or compare with what --dry-run prints."
+            )))
+        }
         Some(_) | None => Ok(()),
     }
 }
 
 fn write_node_file(file: &Path, content: &Value) -> Result<(), CliError> {
-    let failed = |error: std::io::Error| CliError::Failed(format!("the node file {}: {error}", file.display()));
+    let failed = |error: std::io::Error| {
+        CliError::Failed(format!("the node file {}: {error}", file.display()))
+    };
     let there = read_small(file).map_err(failed)?;
     if there.is_some() {
         // The same, as was looked at before.
@@ -246,7 +258,11 @@ fn told(plan: &Plan, document: &Value, token: Option<Value>, dry_run: bool) -> V
     }
     json!({
         "dry_run": dry_run,
-        "node": { "name": plan.key.name().as_str(), "action": plan.node.action, "revision": document.get("revision") },
+        "node": {
+            "name": plan.key.name().as_str(),
+            "action": plan.node.action,
+            "revision": document.get("revision"),
+        },
         "token": of_token,
         "node_file": plan.node_file,
     })
@@ -266,10 +282,7 @@ fn say(options: &JoinOptions, plan: &Plan, answer: &Value, format: Format) {
         }
         (TokenPlace::File(file), None) => {
             let id = answer.pointer("/token/id").and_then(Value::as_str).unwrap_or("-");
-            note(
-                format,
-                &format!("token: {would}written to {} (id {id})", file.display()),
-            );
+            note(format, &format!("token: {would}written to {} (id {id})", file.display()));
         }
         (TokenPlace::Stdout | TokenPlace::None, _) => {}
     }
@@ -281,10 +294,13 @@ fn say(options: &JoinOptions, plan: &Plan, answer: &Value, format: Format) {
     }
 }
 
-/// What stands on standard output for people: the token where that was asked for, else the node file.
+/// What stands on standard output for people: the token where that was asked for, else the node
+/// file.
 fn on_stdout(options: &JoinOptions, plan: &Plan, answer: &Value) -> String {
     match &plan.place {
-        TokenPlace::Stdout if !options.dry_run => member(answer.get("token").unwrap_or(&Value::Null), "text"),
+        TokenPlace::Stdout if !options.dry_run => {
+            member(answer.get("token").unwrap_or(&Value::Null), "text")
+        }
         _ => yaml::document(&plan.node_file),
     }
 }

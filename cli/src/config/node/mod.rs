@@ -20,7 +20,8 @@ use crate::output::Format;
 /// Commands of `blaze node`.
 #[derive(Debug, Subcommand)]
 pub enum NodeCommand {
-    /// Make the document of a node and the token of its worker, and print the node file for its programs
+    /// Make the document of a node and the token of its worker, and print the node file for its
+    /// programs
     Join(Box<JoinOptions>),
 }
 

@@ -26,10 +26,12 @@ pub struct JoinOptions {
     /// Layer that it stands in; the Layer document must be there
     #[arg(long, value_name = "LAYER")]
     pub layer: LayerName,
-    /// What it is: static, gateway (it connects others) or mobile (it moves); a new node is static where nothing is said
+    /// What it is: static, gateway (it connects others) or mobile (it moves); a new node is static
+    /// where nothing is said
     #[arg(long = "type", value_name = "TYPE")]
     pub node_type: Option<NodeType>,
-    /// Its address, may be repeated; the first IPv4 address is that of its interface for other layers and its own
+    /// Its address, may be repeated; the first IPv4 address is that of its interface for other
+    /// layers and its own
     #[arg(long = "address", value_name = "IP")]
     pub addresses: Vec<std::net::IpAddr>,
     /// A label of the document, may be repeated; others that it has stay
@@ -39,14 +41,16 @@ pub struct JoinOptions {
     #[arg(long)]
     pub dry_run: bool,
 
-    /// Where the token goes (mode 0600), or - for standard output; else NAME.token. One that is there is kept
+    /// Where the token goes (mode 0600), or - for standard output; else NAME.token. One that is
+    /// there is kept
     #[arg(long, value_name = "FILE|-", help_heading = "Token")]
     pub token_out: Option<PathBuf>,
     /// Make a new token in place of the one in the file
     #[arg(long, help_heading = "Token", conflicts_with = "no_token")]
     pub renew: bool,
     /// How long the token lives, at most 365d
-    #[arg(long, value_name = "DURATION", default_value = "90d", value_parser = parse_life, help_heading = "Token")]
+    #[arg(long, value_name = "DURATION", default_value = "90d", value_parser = parse_life,
+        help_heading = "Token")]
     pub expires: Duration,
     /// No token: the main service runs with --dev
     #[arg(long, help_heading = "Token", conflicts_with_all = ["token_out", "key_file"])]
@@ -55,10 +59,12 @@ pub struct JoinOptions {
     #[command(flatten)]
     pub signing: SigningOptions,
 
-    /// Where the node file goes instead of standard output; one that is there and says something else is left alone
+    /// Where the node file goes instead of standard output; one that is there and says something
+    /// else is left alone
     #[arg(long, value_name = "FILE", help_heading = "Node file")]
     pub node_file: Option<PathBuf>,
-    /// gRPC port of the main service as the node reaches it; else the host of --server with port 50051
+    /// gRPC port of the main service as the node reaches it; else the host of --server with port
+    /// 50051
     #[arg(long, value_name = "URL", help_heading = "Node file")]
     pub grpc: Option<Url>,
     /// Path of the token on the node; else that of --token-out on this machine
@@ -76,7 +82,8 @@ pub struct JoinOptions {
     /// Redis of the node (redis://…), memory or none; else on an edge node redis://127.0.0.1:6379
     #[arg(long, value_name = "BROKER", help_heading = "Node file")]
     pub node_broker: Option<NodeBrokerChoice>,
-    /// kafka:HOST:PORT[,HOST:PORT…], dds:DOMAIN, memory or none; else dds:10 on an edge node with an address, kafka:127.0.0.1:9092 in fog and cloud
+    /// kafka:HOST:PORT[,HOST:PORT…], dds:DOMAIN, memory or none; else dds:10 on an edge node with
+    /// an address, kafka:127.0.0.1:9092 in fog and cloud
     #[arg(long, value_name = "BROKER", help_heading = "Node file")]
     pub layer_broker: Option<LayerBrokerChoice>,
     /// DDS domain of the way to other layers, the same for all nodes
@@ -111,7 +118,8 @@ impl FromStr for NodeBrokerChoice {
             "memory" => Ok(Self::Section(json!({ "memory": {} }))),
             // It would stand in the list of processes, and in the printed file.
             url if is_redis(url) && has_password(url) => {
-                Err("a password does not belong here: write password_file into the node file".to_owned())
+                Err("a password does not belong here: write password_file into the node file"
+                    .to_owned())
             }
             url if is_redis(url) => Ok(Self::Section(json!({ "redis": { "url": url } }))),
             _ => Err("it is redis://HOST:PORT, memory or none".to_owned()),
@@ -178,9 +186,7 @@ mod tests {
         assert_eq!(node("none"), Ok(NodeBrokerChoice::None));
         assert_eq!(
             node("redis://10.0.0.1:6379"),
-            Ok(NodeBrokerChoice::Section(
-                json!({"redis": {"url": "redis://10.0.0.1:6379"}})
-            ))
+            Ok(NodeBrokerChoice::Section(json!({"redis": {"url": "redis://10.0.0.1:6379"}})))
         );
         assert!(node("redis://:secret@10.0.0.1").unwrap_err().contains("password_file"));
         assert!(node("kafka:a:1").is_err());

@@ -1,5 +1,5 @@
-//! What joining makes of options and of what is there: the document of the node and its node file. Nothing is sent or written
-//! here.
+//! What joining makes of options and of what is there: the document of the node and its node file.
+//! Nothing is sent or written here.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
@@ -36,21 +36,21 @@ pub(super) struct NodePlan {
 ///
 /// # Errors
 /// [`CliError::Invalid`] for a node that stands in another layer.
-pub(super) fn document(options: &JoinOptions, existing: Option<&Value>) -> Result<NodePlan, CliError> {
+pub(super) fn document(
+    options: &JoinOptions,
+    existing: Option<&Value>,
+) -> Result<NodePlan, CliError> {
     let object = |name: &str| {
         let found = existing.and_then(|document| document.get(name)).cloned();
         found.unwrap_or_else(|| json!({}))
     };
     let (mut labels, mut spec) = (object("labels"), object("spec"));
     let layer = options.layer.as_str();
-    if let Some(other) = spec
-        .get("layer")
-        .and_then(Value::as_str)
-        .filter(|other| *other != layer)
-    {
+    if let Some(other) = spec.get("layer").and_then(Value::as_str).filter(|other| *other != layer) {
         let name = &options.name;
         return Err(CliError::Invalid(format!(
-            "node {name} stands in layer {other}, not in {layer}.\n  Join it with --layer {other}, or move it first: blaze patch node {name} -p '{{\"spec\":{{\"layer\":\"{layer}\"}}}}'"
+            "node {name} stands in layer {other}, not in {layer}.\n  Join it with --layer {other}, \
+             or move it first: blaze patch node {name} -p '{{\"spec\":{{\"layer\":\"{layer}\"}}}}'"
         )));
     }
     spec["layer"] = json!(layer);
@@ -67,9 +67,7 @@ pub(super) fn document(options: &JoinOptions, existing: Option<&Value>) -> Resul
     let action = match existing {
         None => "created",
         Some(document)
-            if ["labels", "spec"]
-                .iter()
-                .all(|name| document.get(name) == body.get(name)) =>
+            if ["labels", "spec"].iter().all(|name| document.get(name) == body.get(name)) =>
         {
             "unchanged"
         }
@@ -98,7 +96,8 @@ pub(super) struct Around<'a> {
     pub(super) addresses: &'a [IpAddr],
 }
 
-/// Addresses that a document has. What is none is left out: it is the document's to say, and nothing of it is written.
+/// Addresses that a document has. What is none is left out: it is the document's to say, and
+/// nothing of it is written.
 pub(super) fn addresses_of(document: &Value) -> Vec<IpAddr> {
     let all = document.pointer("/spec/addresses").and_then(Value::as_array);
     let texts = all.into_iter().flatten().filter_map(Value::as_str);
@@ -108,8 +107,12 @@ pub(super) fn addresses_of(document: &Value) -> Vec<IpAddr> {
 /// The node file, and what should be known of it.
 ///
 /// # Errors
-/// [`CliError::Invalid`] with everything that `blaze-flow --check` or `blaze-worker --check` would have against it.
-pub(super) fn node_file(options: &JoinOptions, around: &Around<'_>) -> Result<(Value, Vec<String>), CliError> {
+/// [`CliError::Invalid`] with everything that `blaze-flow --check` or `blaze-worker --check` would
+/// have against it.
+pub(super) fn node_file(
+    options: &JoinOptions,
+    around: &Around<'_>,
+) -> Result<(Value, Vec<String>), CliError> {
     let mut notes = Vec::new();
     let mut config = Map::new();
     config.insert("server".to_owned(), json!(grpc(options, around, &mut notes)?));
@@ -118,7 +121,8 @@ pub(super) fn node_file(options: &JoinOptions, around: &Around<'_>) -> Result<(V
     let (cert_path, key_path) = (options.cert_path.as_deref(), options.key_path.as_deref());
     if around.shows_certificate && cert_path.is_none() {
         notes.push(
-            "the server asks for client certificates: give the worker one of its own with --cert-path and --key-path"
+            "the server asks for client certificates: give the worker one of its own with \
+             --cert-path and --key-path"
                 .to_owned(),
         );
     }
@@ -149,25 +153,32 @@ pub(super) fn node_file(options: &JoinOptions, around: &Around<'_>) -> Result<(V
     )))
 }
 
-fn grpc(options: &JoinOptions, around: &Around<'_>, notes: &mut Vec<String>) -> Result<String, CliError> {
+fn grpc(
+    options: &JoinOptions,
+    around: &Around<'_>,
+    notes: &mut Vec<String>,
+) -> Result<String, CliError> {
     let url = match &options.grpc {
         Some(url) => url.clone(),
         None => {
             let mut url = around.server.clone();
             url.set_path("");
-            url.set_port(Some(GRPC_PORT))
-                .map_err(|()| CliError::Usage("--server has no host: name the gRPC port with --grpc".to_owned()))?;
+            url.set_port(Some(GRPC_PORT)).map_err(|()| {
+                CliError::Usage("--server has no host: name the gRPC port with --grpc".to_owned())
+            })?;
             url
         }
     };
     let host = url.host_str().unwrap_or_default().trim_matches(['[', ']']);
     if is_loopback(&url) {
         notes.push(format!(
-            "config.server is {host}: the node file is for this machine; for another one give --grpc https://HOST:PORT"
+            "config.server is {host}: the node file is for this machine; for another one give \
+             --grpc https://HOST:PORT"
         ));
     } else if url.scheme() == "http" {
         return Err(CliError::Usage(format!(
-            "{url}: the token and secrets would go in clear over a network; give --grpc https://HOST:PORT"
+            "{url}: the token and secrets would go in clear over a network; give --grpc \
+             https://HOST:PORT"
         )));
     }
     Ok(url.as_str().trim_end_matches('/').to_owned())
@@ -187,13 +198,20 @@ fn brokers(options: &JoinOptions, around: &Around<'_>, notes: &mut Vec<String>) 
     };
     let layer = match &options.layer_broker {
         Some(choice) => layer_section(choice, own),
-        None if is_edge => own.map(|own| json!({ "dds": { "domain": LAYER_DOMAIN, "interface": own } })),
+        None if is_edge => {
+            own.map(|own| json!({ "dds": { "domain": LAYER_DOMAIN, "interface": own } }))
+        }
         None => Some(json!({ "kafka": { "bootstrap": [LAYER_KAFKA] } })),
     };
-    let inter =
-        own.map(|own| json!({ "dds": { "domain": options.inter_domain, "listen": own, "peers": options.peers } }));
+    let inter = own.map(|own| {
+        json!({ "dds": { "domain": options.inter_domain, "listen": own,
+            "peers": options.peers } })
+    });
     if inter.is_none() {
-        notes.push("without --address the node reaches no other layer: brokers.inter is left out".to_owned());
+        notes.push(
+            "without --address the node reaches no other layer: brokers.inter is left out"
+                .to_owned(),
+        );
     }
     for (scope, section) in [("node", node), ("layer", layer), ("inter", inter)] {
         if let Some(section) = section {
@@ -228,11 +246,10 @@ fn faults(file: &Value) -> Vec<Fault> {
             faults.push(fault);
         }
     }
-    if let Some(Err(OpenError::Setting { key, reason })) = read.brokers.layer.as_ref().map(check_layer) {
-        faults.push(Fault {
-            path: format!("brokers.layer.{key}"),
-            detail: reason,
-        });
+    if let Some(Err(OpenError::Setting { key, reason })) =
+        read.brokers.layer.as_ref().map(check_layer)
+    {
+        faults.push(Fault { path: format!("brokers.layer.{key}"), detail: reason });
     }
     faults
 }

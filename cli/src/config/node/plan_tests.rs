@@ -45,7 +45,11 @@ fn an_edge_node_has_redis_and_fog_and_cloud_have_kafka() {
     );
     assert_eq!(
         edge["config"],
-        json!({ "server": "https://10.0.3.1:50051", "ca_file": "/etc/blaze/ca.pem", "token_file": "/etc/blaze/token" })
+        json!({
+            "server": "https://10.0.3.1:50051",
+            "ca_file": "/etc/blaze/ca.pem",
+            "token_file": "/etc/blaze/token",
+        })
     );
     assert!(notes.is_empty(), "{notes:?}");
     for kind in ["fog", "cloud"] {
@@ -87,12 +91,10 @@ fn a_worker_has_a_certificate_of_its_own_or_it_is_said_that_it_needs_one() {
 
 #[test]
 fn options_win_and_what_the_programs_refuse_is_refused() {
-    let line = "--node-broker none --layer-broker kafka:a:1,b:2 --grpc https://main:7 --token-path /t --ca-path /c";
+    let line = "--node-broker none --layer-broker kafka:a:1,b:2 --grpc https://main:7 --token-path \
+        /t --ca-path /c";
     let (file_, _) = file(line, "edge").unwrap();
-    assert_eq!(
-        file_["brokers"],
-        json!({ "layer": { "kafka": { "bootstrap": ["a:1", "b:2"] } } })
-    );
+    assert_eq!(file_["brokers"], json!({ "layer": { "kafka": { "bootstrap": ["a:1", "b:2"] } } }));
     assert_eq!(
         file_["config"],
         json!({ "server": "https://main:7", "ca_file": "/c", "token_file": "/t" })
@@ -115,21 +117,24 @@ fn options_win_and_what_the_programs_refuse_is_refused() {
 
 #[test]
 fn what_a_document_has_stays_but_for_what_is_said() {
-    let new = document(&options("--type mobile --address 10.0.1.1 --label site=lab"), None).unwrap();
+    let new =
+        document(&options("--type mobile --address 10.0.1.1 --label site=lab"), None).unwrap();
     assert_eq!(new.action, "created");
     assert_eq!(
         new.body,
-        json!({ "labels": { "site": "lab" }, "spec": { "layer": "edge", "type": "mobile", "addresses": ["10.0.1.1"] } })
+        json!({
+            "labels": { "site": "lab" },
+            "spec": { "layer": "edge", "type": "mobile", "addresses": ["10.0.1.1"] },
+        })
     );
     let there = json!({
-        "kind": "Node", "name": "robot-1", "labels": { "a": "b" }, "annotations": { "c": "d" }, "revision": 4,
+        "kind": "Node", "name": "robot-1", "labels": { "a": "b" }, "annotations": { "c": "d" },
+        "revision": 4,
         "spec": { "layer": "edge", "type": "gateway", "config": { "x": 1 } },
     });
     assert_eq!(document(&options(""), Some(&there)).unwrap().action, "unchanged");
     assert_eq!(
-        document(&options("--type gateway --label a=b"), Some(&there))
-            .unwrap()
-            .action,
+        document(&options("--type gateway --label a=b"), Some(&there)).unwrap().action,
         "unchanged"
     );
     let changed = document(&options("--type static --label site=lab"), Some(&there)).unwrap();

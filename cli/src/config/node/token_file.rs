@@ -1,4 +1,5 @@
-//! The file with the token of a worker: whether what is there will do, and how a new one gets there.
+//! The file with the token of a worker: whether what is there will do, and how a new one gets
+//! there.
 
 use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
@@ -21,18 +22,22 @@ pub(super) enum TokenPlace {
     File(PathBuf),
 }
 
-/// The file with a token that will do for a worker of that layer, in words; `None`: there is no file.
+/// The file with a token that will do for a worker of that layer, in words; `None`: there is no
+/// file.
 ///
 /// # Errors
-/// [`CliError::Failed`] for a file that cannot be read, [`CliError::Invalid`] for one that holds something else. No text of it is
-/// repeated.
+/// [`CliError::Failed`] for a file that cannot be read, [`CliError::Invalid`] for one that holds
+/// something else. No text of it is repeated.
 pub(super) fn inspect(file: &Path, layer: &str, now_ms: i64) -> Result<Option<String>, CliError> {
     let place = file.display();
-    let content = read_small(file).map_err(|error| CliError::Failed(format!("the token file {place}: {error}")))?;
+    let content = read_small(file)
+        .map_err(|error| CliError::Failed(format!("the token file {place}: {error}")))?;
     let Some(content) = content else {
         return Ok(None);
     };
-    let unfit = |why: String| CliError::Invalid(format!("{place} {why}.\n  Give --renew for a new one in its place."));
+    let unfit = |why: String| {
+        CliError::Invalid(format!("{place} {why}.\n  Give --renew for a new one in its place."))
+    };
     let text = String::from_utf8(content).map_err(|_| unfit("holds no token".to_owned()))?;
     let token = look_into(text.trim()).map_err(|_| unfit("holds no token".to_owned()))?;
     let claim = |name: &str| token.pointer(&format!("/claims/{name}"));
@@ -44,12 +49,10 @@ pub(super) fn inspect(file: &Path, layer: &str, now_ms: i64) -> Result<Option<St
     if of != layer {
         return Err(unfit(format!("holds a token for layer {}", printable(of))));
     }
-    let left_s = claim("exp").and_then(Value::as_i64).unwrap_or_default() - now_ms.div_euclid(1_000);
+    let left_s =
+        claim("exp").and_then(Value::as_i64).unwrap_or_default() - now_ms.div_euclid(1_000);
     if left_s <= 0 {
-        return Err(unfit(format!(
-            "holds a token that ran out {} ago",
-            short_duration(-left_s)
-        )));
+        return Err(unfit(format!("holds a token that ran out {} ago", short_duration(-left_s))));
     }
     Ok(Some(format!("runs out in {}", short_duration(left_s))))
 }
@@ -67,8 +70,7 @@ pub(super) fn check_writable(file: &Path) -> Result<(), CliError> {
     let name = name.ok_or_else(|| failed("has no name".to_owned()))?;
     let trial = file.with_file_name(format!(".{name}.{}.trial", std::process::id()));
     let made = OpenOptions::new().write(true).create_new(true).open(&trial);
-    made.and_then(|_| std::fs::remove_file(&trial))
-        .map_err(|error| failed(error.to_string()))
+    made.and_then(|_| std::fs::remove_file(&trial)).map_err(|error| failed(error.to_string()))
 }
 
 /// Writes a token for its owner alone; a reader finds the old one or the new one, whole.
@@ -76,7 +78,9 @@ pub(super) fn check_writable(file: &Path) -> Result<(), CliError> {
 /// # Errors
 /// [`CliError::Failed`].
 pub(super) fn write(file: &Path, token: &str) -> Result<(), CliError> {
-    let failed = |error: std::io::Error| CliError::Failed(format!("the token file {}: {error}", file.display()));
+    let failed = |error: std::io::Error| {
+        CliError::Failed(format!("the token file {}: {error}", file.display()))
+    };
     write_atomically(file, format!("{token}\n").as_bytes()).map_err(failed)
 }
 
@@ -117,10 +121,9 @@ mod tests {
         make("worker", Some("edge"));
         assert_eq!(std::fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
         assert_eq!(inspect(&file, "edge", NOW_MS).unwrap().unwrap(), "runs out in 2h");
-        for (now_ms, layer, why) in [
-            (NOW_MS, "fog", "for layer edge"),
-            (NOW_MS + 7_300_000, "edge", "ran out 1m ago"),
-        ] {
+        for (now_ms, layer, why) in
+            [(NOW_MS, "fog", "for layer edge"), (NOW_MS + 7_300_000, "edge", "ran out 1m ago")]
+        {
             let error = inspect(&file, layer, now_ms).unwrap_err();
             assert_eq!(error.exit() as u8, 7);
             assert!(
@@ -130,10 +133,7 @@ mod tests {
         }
         make("viewer", None);
         assert!(
-            inspect(&file, "edge", NOW_MS)
-                .unwrap_err()
-                .to_string()
-                .contains("not for a worker")
+            inspect(&file, "edge", NOW_MS).unwrap_err().to_string().contains("not for a worker")
         );
         std::fs::write(&file, "sesame").unwrap();
         let error = inspect(&file, "edge", NOW_MS).unwrap_err();

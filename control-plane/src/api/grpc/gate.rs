@@ -1,4 +1,5 @@
-//! Before and after every call of `ConfigService`: who asks, whether it may, for how long, and what became of it.
+//! Before and after every call of `ConfigService`: who asks, whether it may, for how long, and what
+//! became of it.
 //!
 //! ```text
 //! head ─▶ --dev ─▶ address ─▶ token ─▶ rate ─▶ method ─▶ right ─▶ time ─▶ message ─▶ in flight ─▶ call
@@ -8,9 +9,9 @@
 //!
 //! The numbers are the codes of gRPC of the refusals.
 //!
-//! Everything before the message is decided by the head alone, so nobody without a token makes the service read one. The caller
-//! goes to the call as a [`Call`] in the request; a call without one is refused, so that none can be served around this
-//! gate.
+//! Everything before the message is decided by the head alone, so nobody without a token makes the
+//! service read one. The caller goes to the call as a [`Call`] in the request; a call without one
+//! is refused, so that none can be served around this gate.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -106,13 +107,10 @@ impl Gate {
         };
         let mut response = match self.admit(head, &claims, request.headers()) {
             Ok((method, time)) => {
-                let caller = Caller {
-                    claims,
-                    request_id: head.id.clone(),
-                    address: head.address,
-                };
+                let caller = Caller { claims, request_id: head.id.clone(), address: head.address };
                 let limits = &self.limits;
-                // The messages of a worker come as long as its stream is open: they are no upload on its way.
+                // The messages of a worker come as long as its stream is open: they are no upload
+                // on its way.
                 let request = match method == methods::SYNC {
                     true => request,
                     false => request.map(|body| limits.metered(body)),
@@ -138,9 +136,7 @@ impl Gate {
         let token = request::bearer(headers);
         let claims = self.core.authenticate(token, head.address);
         if token.is_some()
-            && claims
-                .as_ref()
-                .is_err_and(|problem| problem.code == Code::Unauthenticated)
+            && claims.as_ref().is_err_and(|problem| problem.code == Code::Unauthenticated)
         {
             self.limits.count_refused_token(head.address);
         }
@@ -148,18 +144,38 @@ impl Gate {
     }
 
     /// Which method, and how long it may take.
-    fn admit(&self, head: &Head, claims: &Claims, headers: &HeaderMap) -> Result<(&'static Method, Duration), Problem> {
+    fn admit(
+        &self,
+        head: &Head,
+        claims: &Claims,
+        headers: &HeaderMap,
+    ) -> Result<(&'static Method, Duration), Problem> {
         self.limits.count_request(&claims.subject)?;
-        let none = || Problem::new(Code::MethodNotAllowed, "there is no such service or method here");
+        let none =
+            || Problem::new(Code::MethodNotAllowed, "there is no such service or method here");
         let method = head.method.ok_or_else(none)?;
         self.core.authorize(claims, method.right)?;
         Ok((method, call_time(headers)?))
     }
 
-    fn refuse(&self, head: &Head, claims: Option<&Claims>, problem: &Problem, action: &str) -> Response {
+    fn refuse(
+        &self,
+        head: &Head,
+        claims: Option<&Claims>,
+        problem: &Problem,
+        action: &str,
+    ) -> Response {
         if is_denial(problem) {
-            let (code, internal) = (problem.code.as_str(), problem.internal.as_deref().unwrap_or_default());
-            tracing::info!(target: "blaze_config::access", action, code, peer = %head.address, internal, "refused");
+            let (code, internal) =
+                (problem.code.as_str(), problem.internal.as_deref().unwrap_or_default());
+            tracing::info!(
+                target: "blaze_config::access",
+                action,
+                code,
+                peer = %head.address,
+                internal,
+                "refused",
+            );
             self.core.denied(claims, problem, action, None, &head.id, head.address);
         }
         status::from_problem(problem, &head.id).into_http()
@@ -168,13 +184,7 @@ impl Gate {
 
 impl Call {
     fn new(caller: Caller, method: &'static Method) -> Self {
-        Self {
-            caller,
-            method,
-            action: method.action,
-            key: None,
-            begun: Arc::default(),
-        }
+        Self { caller, method, action: method.action, key: None, begun: Arc::default() }
     }
 }
 
@@ -230,7 +240,8 @@ fn parse_timeout(text: &str) -> Option<Duration> {
     }
 }
 
-/// Gives the code of a response for metrics, and a refusal by the library the details that ours have.
+/// Gives the code of a response for metrics, and a refusal by the library the details that ours
+/// have.
 fn explain(response: &mut Response, request_id: &str, most_bytes: usize) -> &'static str {
     let held = response.extensions().get::<Status>().cloned();
     let Some(found) = held.or_else(|| Status::from_header_map(response.headers())) else {
@@ -243,7 +254,8 @@ fn explain(response: &mut Response, request_id: &str, most_bytes: usize) -> &'st
         return code.as_str();
     }
     let problem = as_problem(&found, most_bytes);
-    let old = std::mem::replace(response, status::from_problem(&problem, request_id).into_http::<Body>());
+    let old =
+        std::mem::replace(response, status::from_problem(&problem, request_id).into_http::<Body>());
     for (name, value) in old.headers() {
         response.headers_mut().entry(name).or_insert_with(|| value.clone());
     }
@@ -259,13 +271,16 @@ fn as_problem(found: &Status, most_bytes: usize) -> Problem {
         (tonic::Code::Unimplemented, "") => {
             Problem::new(Code::MethodNotAllowed, "there is no such service or method here")
         }
-        // The message is not in the compression that the client said, or in one that is not offered.
+        // The message is not in the compression that the client said, or in one that is not
+        // offered.
         (tonic::Code::Unimplemented, message) => Problem::new(Code::MethodNotAllowed, message),
         (tonic::Code::NotFound, message) => Problem::new(Code::NotFound, message),
         (tonic::Code::OutOfRange | tonic::Code::ResourceExhausted, _) => {
             Problem::new(Code::PayloadTooLarge, format!("a message may have {most_bytes} bytes"))
         }
-        (_, message) => Problem::new(Code::InvalidRequest, format!("the message cannot be read: {message}")),
+        (_, message) => {
+            Problem::new(Code::InvalidRequest, format!("the message cannot be read: {message}"))
+        }
     }
 }
 
@@ -331,16 +346,10 @@ mod tests {
     #[test]
     fn refusals_of_the_library_get_a_code_and_details() {
         for (status, code) in [
-            (
-                Status::out_of_range("decoded message length too large"),
-                "payload_too_large",
-            ),
+            (Status::out_of_range("decoded message length too large"), "payload_too_large"),
             (Status::internal("failed to decode Protobuf message"), "invalid_request"),
             (Status::unimplemented(""), "method_not_allowed"),
-            (
-                Status::from_error(Problem::new(Code::RateLimited, "").into()),
-                "rate_limited",
-            ),
+            (Status::from_error(Problem::new(Code::RateLimited, "").into()), "rate_limited"),
         ] {
             let mut response = status.into_http::<Body>();
             response.headers_mut().insert(REVISION, 7.into());

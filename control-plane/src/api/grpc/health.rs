@@ -1,4 +1,5 @@
-//! `grpc.health.v1.Health`: whether the service does its work, as `/readyz` says it. Without a token.
+//! `grpc.health.v1.Health`: whether the service does its work, as `/readyz` says it. Without a
+//! token.
 
 use std::future::ready;
 use std::pin::Pin;
@@ -26,11 +27,7 @@ fn answer(status: ServingStatus) -> HealthCheckResponse {
 }
 
 fn serving(is_ready: bool) -> ServingStatus {
-    if is_ready {
-        ServingStatus::Serving
-    } else {
-        ServingStatus::NotServing
-    }
+    if is_ready { ServingStatus::Serving } else { ServingStatus::NotServing }
 }
 
 fn is_known(request: &Request<HealthCheckRequest>) -> bool {
@@ -39,7 +36,10 @@ fn is_known(request: &Request<HealthCheckRequest>) -> bool {
 
 #[tonic::async_trait]
 impl Health for Readyz {
-    async fn check(&self, request: Request<HealthCheckRequest>) -> Result<Response<HealthCheckResponse>, Status> {
+    async fn check(
+        &self,
+        request: Request<HealthCheckRequest>,
+    ) -> Result<Response<HealthCheckResponse>, Status> {
         if !is_known(&request) {
             return Err(Status::not_found("there is no service of that name here"));
         }
@@ -48,7 +48,10 @@ impl Health for Readyz {
 
     type WatchStream = Pin<Box<dyn Stream<Item = Result<HealthCheckResponse, Status>> + Send>>;
 
-    async fn watch(&self, request: Request<HealthCheckRequest>) -> Result<Response<Self::WatchStream>, Status> {
+    async fn watch(
+        &self,
+        request: Request<HealthCheckRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
         let statuses = if is_known(&request) {
             changes(&self.readiness).map(serving).left_stream()
         } else {
@@ -80,16 +83,11 @@ mod tests {
     use super::*;
 
     fn health(readiness: &Readiness) -> Readyz {
-        Readyz {
-            readiness: readiness.clone(),
-            stopping: CancellationToken::new(),
-        }
+        Readyz { readiness: readiness.clone(), stopping: CancellationToken::new() }
     }
 
     fn request(service: &str) -> Request<HealthCheckRequest> {
-        Request::new(HealthCheckRequest {
-            service: service.into(),
-        })
+        Request::new(HealthCheckRequest { service: service.into() })
     }
 
     #[tokio::test]
@@ -117,25 +115,16 @@ mod tests {
         assert_eq!(stream.next().await.unwrap().unwrap().status(), ServingStatus::Serving);
         readiness.set("store", CheckStatus::Ok, "other words");
         readiness.set("store", CheckStatus::Failed, "gone");
-        assert_eq!(
-            stream.next().await.unwrap().unwrap().status(),
-            ServingStatus::NotServing
-        );
+        assert_eq!(stream.next().await.unwrap().unwrap().status(), ServingStatus::NotServing);
         readiness.set("store", CheckStatus::Ok, "");
         assert_eq!(stream.next().await.unwrap().unwrap().status(), ServingStatus::Serving);
 
         let mut unknown = health.watch(request("blaze.v1.Other")).await.unwrap().into_inner();
-        assert_eq!(
-            unknown.next().await.unwrap().unwrap().status(),
-            ServingStatus::ServiceUnknown
-        );
+        assert_eq!(unknown.next().await.unwrap().unwrap().status(), ServingStatus::ServiceUnknown);
 
         health.stopping.cancel();
         for stream in [&mut stream, &mut unknown] {
-            assert_eq!(
-                stream.next().await.unwrap().unwrap().status(),
-                ServingStatus::NotServing
-            );
+            assert_eq!(stream.next().await.unwrap().unwrap().status(), ServingStatus::NotServing);
             assert!(stream.next().await.is_none());
         }
     }

@@ -1,4 +1,5 @@
-//! Messages of requests as the core wants them. What cannot be read is refused here, what makes no sense by the core.
+//! Messages of requests as the core wants them. What cannot be read is refused here, what makes no
+//! sense by the core.
 
 use std::str::FromStr;
 
@@ -12,7 +13,8 @@ use sha2::{Digest as _, Sha256};
 use super::MAX_APPLY_BYTES;
 use crate::api::DEFAULT_TOKEN_LIFE_S;
 use crate::core::{
-    ApplyItem, ApplyRequest, DocumentInput, Idempotency, ListQuery, Place, Precondition, ReadOptions, WatchQuery,
+    ApplyItem, ApplyRequest, DocumentInput, Idempotency, ListQuery, Place, Precondition,
+    ReadOptions, WatchQuery,
 };
 use crate::store::AuditQuery;
 
@@ -25,7 +27,10 @@ fn unreadable(error: &WireError) -> Problem {
 }
 
 /// A name, or none where the text is empty.
-pub(super) fn optional<T: FromStr<Err = NameError>>(member: &str, text: &str) -> Result<Option<T>, Problem> {
+pub(super) fn optional<T: FromStr<Err = NameError>>(
+    member: &str,
+    text: &str,
+) -> Result<Option<T>, Problem> {
     match text {
         "" => Ok(None),
         text => required(member, text).map(Some),
@@ -33,9 +38,11 @@ pub(super) fn optional<T: FromStr<Err = NameError>>(member: &str, text: &str) ->
 }
 
 /// A name that must be there.
-pub(super) fn required<T: FromStr<Err = NameError>>(member: &str, text: &str) -> Result<T, Problem> {
-    text.parse::<T>()
-        .map_err(|error| invalid(format!("{member} {text:?} {error}")))
+pub(super) fn required<T: FromStr<Err = NameError>>(
+    member: &str,
+    text: &str,
+) -> Result<T, Problem> {
+    text.parse::<T>().map_err(|error| invalid(format!("{member} {text:?} {error}")))
 }
 
 fn text(text: String) -> Option<String> {
@@ -189,11 +196,7 @@ fn apply_item(wire: v1::ApplyItem) -> Result<ApplyItem, Problem> {
         // Only the name counts.
         document.spec_json.clear();
     }
-    Ok(ApplyItem {
-        input: input(document)?,
-        revision,
-        delete: wire.delete,
-    })
+    Ok(ApplyItem { input: input(document)?, revision, delete: wire.delete })
 }
 
 /// A problem of one item, as one of the whole request.
@@ -211,7 +214,11 @@ pub(super) fn merge_patch(text: &str) -> Result<Value, Problem> {
 }
 
 /// The key of a request that may come twice, if it has one.
-pub(super) fn idempotency(method: &str, key: &str, message: &impl Message) -> Result<Option<Idempotency>, Problem> {
+pub(super) fn idempotency(
+    method: &str,
+    key: &str,
+    message: &impl Message,
+) -> Result<Option<Idempotency>, Problem> {
     if key.is_empty() {
         return Ok(None);
     }
@@ -277,9 +284,7 @@ fn outcome(word: &str) -> Result<bool, Problem> {
     match word {
         "allowed" => Ok(true),
         "denied" => Ok(false),
-        _ => Err(invalid(format!(
-            "filter_json: outcome {word:?} is not one of allowed, denied"
-        ))),
+        _ => Err(invalid(format!("filter_json: outcome {word:?} is not one of allowed, denied"))),
     }
 }
 

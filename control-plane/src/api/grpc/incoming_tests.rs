@@ -4,28 +4,17 @@ use serde_json::json;
 use super::*;
 
 fn reference(kind: v1::Kind, service: &str, name: &str) -> v1::Ref {
-    v1::Ref {
-        kind: kind.into(),
-        name: name.into(),
-        service: service.into(),
-    }
+    v1::Ref { kind: kind.into(), name: name.into(), service: service.into() }
 }
 
 fn document(reference: v1::Ref, spec: &str) -> v1::Document {
-    v1::Document {
-        r#ref: Some(reference),
-        spec_json: spec.into(),
-        ..Default::default()
-    }
+    v1::Document { r#ref: Some(reference), spec_json: spec.into(), ..Default::default() }
 }
 
 #[test]
 fn a_document_without_spec_has_an_empty_one() {
     let input = input(Some(document(reference(v1::Kind::Service, "", "slam"), ""))).unwrap();
-    assert_eq!(
-        (input.key.to_string().as_str(), input.spec),
-        ("Service/slam", json!({}))
-    );
+    assert_eq!((input.key.to_string().as_str(), input.spec), ("Service/slam", json!({})));
 }
 
 #[test]
@@ -73,10 +62,7 @@ fn zero_and_empty_mean_not_said() {
     assert_eq!(page(Some(v1::Page::default())), (None, String::new()));
     assert_eq!(watch(v1::WatchRequest::default()), Ok(WatchQuery::default()));
     assert_eq!(place(None), Ok(Place::default()));
-    let since = v1::WatchRequest {
-        since: Some(0),
-        ..Default::default()
-    };
+    let since = v1::WatchRequest { since: Some(0), ..Default::default() };
     assert_eq!(watch(since).unwrap().since, Some(0));
 }
 
@@ -85,21 +71,13 @@ fn a_revision_that_must_be_said_is_above_zero() {
     assert_eq!(revision("from_revision", 7), Ok(7));
     let problem = revision("from_revision", 0).unwrap_err();
     assert_eq!(problem.code, Code::InvalidRequest);
-    assert!(
-        problem.detail.starts_with("from_revision is missing"),
-        "{}",
-        problem.detail
-    );
+    assert!(problem.detail.starts_with("from_revision is missing"), "{}", problem.detail);
 }
 
 #[test]
 fn only_instances_have_a_service() {
     let list = |kind: v1::Kind| {
-        list(v1::ListRequest {
-            kind: kind.into(),
-            service: "slam".into(),
-            ..Default::default()
-        })
+        list(v1::ListRequest { kind: kind.into(), service: "slam".into(), ..Default::default() })
     };
     assert!(list(v1::Kind::Instance).is_ok());
     assert_eq!(list(v1::Kind::Node).unwrap_err().code, Code::InvalidRequest);
@@ -111,15 +89,9 @@ fn apply_knows_deletions_and_preconditions_and_where_a_fault_is() {
     good.revision = 7;
     let mut gone = document(reference(v1::Kind::Layer, "", "fog"), "no JSON at all");
     gone.labels.insert("a".into(), "b".into());
-    let item = |document, delete| v1::ApplyItem {
-        document: Some(document),
-        delete,
-    };
-    let request = |items| v1::ApplyRequest {
-        items,
-        prune: "site=lab".into(),
-        ..Default::default()
-    };
+    let item = |document, delete| v1::ApplyItem { document: Some(document), delete };
+    let request =
+        |items| v1::ApplyRequest { items, prune: "site=lab".into(), ..Default::default() };
     let read = apply(request(vec![item(good, false), item(gone.clone(), true)])).unwrap();
     let items: Vec<_> = read.items.iter().map(|item| (item.revision, item.delete)).collect();
     assert_eq!(items, [(Some(7), false), (None, true)]);
@@ -130,17 +102,10 @@ fn apply_knows_deletions_and_preconditions_and_where_a_fault_is() {
     assert_eq!(problem.errors[0].document, Some(1));
     assert!(problem.detail.starts_with("items[1]: /name: "), "{}", problem.detail);
     let problem = apply(request(vec![item(gone, false)])).unwrap_err();
-    assert!(
-        problem.detail.starts_with("items[0]: spec_json: "),
-        "{}",
-        problem.detail
-    );
+    assert!(problem.detail.starts_with("items[0]: spec_json: "), "{}", problem.detail);
 
     let large = document(reference(v1::Kind::Layer, "", "edge"), &" ".repeat(MAX_APPLY_BYTES));
-    assert_eq!(
-        apply(request(vec![item(large, false)])).unwrap_err().code,
-        Code::PayloadTooLarge
-    );
+    assert_eq!(apply(request(vec![item(large, false)])).unwrap_err().code, Code::PayloadTooLarge);
 }
 
 #[test]
@@ -149,7 +114,9 @@ fn a_key_is_bound_to_method_and_message() {
         document: Some(document(reference(v1::Kind::Layer, "", "edge"), "{}")),
         request_id: "k".into(),
     };
-    let of = |method: &str, message: &v1::CreateRequest| idempotency(method, "k", message).unwrap().unwrap();
+    let of = |method: &str, message: &v1::CreateRequest| {
+        idempotency(method, "k", message).unwrap().unwrap()
+    };
     assert_eq!(of("Create", &message), of("Create", &message.clone()));
     assert_eq!(of("Create", &message).path, "grpc/Create");
     let mut other = message.clone();
@@ -158,10 +125,7 @@ fn a_key_is_bound_to_method_and_message() {
 
     assert_eq!(idempotency("Create", "", &message), Ok(None));
     for bad in ["a b", "ä", &"a".repeat(129)] {
-        assert_eq!(
-            idempotency("Create", bad, &message).unwrap_err().code,
-            Code::InvalidRequest
-        );
+        assert_eq!(idempotency("Create", bad, &message).unwrap_err().code, Code::InvalidRequest);
     }
 }
 
@@ -171,16 +135,10 @@ fn the_filter_of_the_audit_has_the_members_of_rest() {
         r#"{"subject":"ops","kind":"Node","name":"robot-1","action":"update","outcome":"denied","#,
         r#""since_time":"2026-11-21T07:01:12.345Z","until_time":"2026-11-22T07:01:12.345Z"}"#,
     );
-    let page = v1::Page {
-        limit: 7,
-        page_token: "t".into(),
-    };
+    let page = v1::Page { limit: 7, page_token: "t".into() };
     let (query, token) = audit(filter, Some(page)).unwrap();
     assert_eq!((query.limit, query.allowed, token.as_str()), (7, Some(false), "t"));
-    assert_eq!(
-        (query.subject.as_deref(), query.kind.as_deref()),
-        (Some("ops"), Some("Node"))
-    );
+    assert_eq!((query.subject.as_deref(), query.kind.as_deref()), (Some("ops"), Some("Node")));
     assert!(query.since < query.until);
     assert_eq!(audit("", None), Ok((AuditQuery::default(), String::new())));
 

@@ -1,4 +1,5 @@
-//! The methods of `blaze.v1.ConfigService`: what right each needs. A method that is not in this table is not served.
+//! The methods of `blaze.v1.ConfigService`: what right each needs. A method that is not in this
+//! table is not served.
 
 use crate::auth::Right;
 
@@ -22,30 +23,15 @@ pub(super) struct Method {
 }
 
 const fn reads(name: &'static str, action: &'static str) -> Method {
-    Method {
-        name,
-        right: Right::Read,
-        action,
-        writes: false,
-    }
+    Method { name, right: Right::Read, action, writes: false }
 }
 
 const fn writes(name: &'static str, action: &'static str) -> Method {
-    Method {
-        name,
-        right: Right::Write,
-        action,
-        writes: true,
-    }
+    Method { name, right: Right::Write, action, writes: true }
 }
 
 const fn admin(name: &'static str, action: &'static str, writes: bool) -> Method {
-    Method {
-        name,
-        right: Right::Admin,
-        action,
-        writes,
-    }
+    Method { name, right: Right::Admin, action, writes }
 }
 
 /// All methods, in the order of the proto file.
@@ -74,13 +60,10 @@ pub(super) const METHODS: &[Method] = &[
     writes("Revert", "revert"),
 ];
 
-/// What workers call. It has a stream in both directions, so neither its body nor its answer ends soon.
-pub(super) const SYNC: &Method = &Method {
-    name: "Sync",
-    right: Right::Sync,
-    action: "sync",
-    writes: false,
-};
+/// What workers call. It has a stream in both directions, so neither its body nor its answer ends
+/// soon.
+pub(super) const SYNC: &Method =
+    &Method { name: "Sync", right: Right::Sync, action: "sync", writes: false };
 
 /// The method of a path.
 pub(super) fn of_path(path: &str) -> Option<&'static Method> {
@@ -102,7 +85,8 @@ mod tests {
         let set = google::FileDescriptorSet::decode(CONFIG_DESCRIPTORS).unwrap();
         let mut services = set.file.iter().flat_map(|file| &file.service);
         let service = services.find(|service| service.name() == "ConfigService").unwrap();
-        let names: Vec<_> = service.method.iter().map(google::MethodDescriptorProto::name).collect();
+        let names: Vec<_> =
+            service.method.iter().map(google::MethodDescriptorProto::name).collect();
         let table: Vec<_> = METHODS.iter().map(|method| method.name).collect();
         assert_eq!(table, names);
     }

@@ -8,7 +8,8 @@
 //!               └─ grpc.reflection.v1, v1alpha      without a token, only if it is switched on
 //! ```
 //!
-//! Streams per connection, keepalive and the sizes of frames belong to the listener that serves the router.
+//! Streams per connection, keepalive and the sizes of frames belong to the listener that serves the
+//! router.
 
 mod gate;
 mod health;
@@ -63,8 +64,8 @@ pub struct GrpcOptions {
     pub stopping: CancellationToken,
 }
 
-/// All services. What is none of them is answered with UNIMPLEMENTED. The listener must put the client's address into
-/// each request as `ConnectInfo<SocketAddr>`.
+/// All services. What is none of them is answered with UNIMPLEMENTED. The listener must put the
+/// client's address into each request as `ConnectInfo<SocketAddr>`.
 pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
     let gate = Arc::new(gate::Gate {
         core: service.clone(),
@@ -78,27 +79,19 @@ pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
         Arc::clone(&options.metrics),
     );
     let workers = SyncServiceServer::new(workers).max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let config = ConfigServiceServer::new(service::Service::new(service, options.limits, options.metrics))
-        .max_decoding_message_size(MAX_MESSAGE_BYTES);
+    let config =
+        ConfigServiceServer::new(service::Service::new(service, options.limits, options.metrics))
+            .max_decoding_message_size(MAX_MESSAGE_BYTES);
     let config = Routes::new(config)
         .add_service(workers)
         .into_axum_router()
         .reset_fallback()
         .route_layer(middleware::from_fn_with_state(Arc::clone(&gate), gate::gate));
 
-    let health = health::Readyz {
-        readiness: options.readiness,
-        stopping: options.stopping,
-    };
+    let health = health::Readyz { readiness: options.readiness, stopping: options.stopping };
     let open = Routes::new(HealthServer::new(health).max_decoding_message_size(MAX_OPEN_BYTES));
-    let open = if options.reflection {
-        with_reflection(open)
-    } else {
-        open
-    };
-    open.into_axum_router()
-        .layer(middleware::from_fn_with_state(gate, gate::open))
-        .merge(config)
+    let open = if options.reflection { with_reflection(open) } else { open };
+    open.into_axum_router().layer(middleware::from_fn_with_state(gate, gate::open)).merge(config)
 }
 
 fn with_reflection(routes: Routes) -> Routes {

@@ -9,7 +9,8 @@ use blaze_proto::{google, v1};
 use serde_json::Value;
 
 use crate::core::{
-    ApplyAction, ApplyReport, ApplyResult, Effective, HistoryEntry, Page, Place, WatchCommit, WatchOp, Written,
+    ApplyAction, ApplyReport, ApplyResult, Effective, HistoryEntry, Page, Place, WatchCommit,
+    WatchOp, Written,
 };
 use crate::store::{Op, TokenRecord};
 
@@ -35,9 +36,7 @@ pub(super) fn written(written: &Written) -> v1::Document {
 }
 
 pub(super) fn json(value: &Value) -> v1::JsonResponse {
-    v1::JsonResponse {
-        json: value.to_string(),
-    }
+    v1::JsonResponse { json: value.to_string() }
 }
 
 pub(super) fn list(page: Page<Arc<Document>>, revision: u64) -> v1::ListResponse {
@@ -128,11 +127,7 @@ fn history_entry(entry: HistoryEntry) -> v1::HistoryEntry {
 }
 
 pub(super) fn token(record: TokenRecord, token: String) -> v1::CreateTokenResponse {
-    v1::CreateTokenResponse {
-        id: record.id,
-        token,
-        expire_time: time(record.expire_time),
-    }
+    v1::CreateTokenResponse { id: record.id, token, expire_time: time(record.expire_time) }
 }
 
 /// Made once for all watchers that share the commit.
@@ -154,10 +149,7 @@ fn change((op, of): &(WatchOp, Arc<Document>)) -> v1::Change {
         WatchOp::Delete => v1::Op::Delete,
         WatchOp::Leave => v1::Op::Leave,
     };
-    v1::Change {
-        op: op.into(),
-        document: Some(document(of)),
-    }
+    v1::Change { op: op.into(), document: Some(document(of)) }
 }
 
 #[cfg(test)]

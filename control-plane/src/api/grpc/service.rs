@@ -62,12 +62,12 @@ impl Service {
         }
     }
 
-    pub(super) fn new(core: ConfigService, limits: Arc<ApiLimits>, metrics: Arc<ApiMetrics>) -> Self {
-        Self {
-            operations: Operations { core },
-            limits,
-            metrics,
-        }
+    pub(super) fn new(
+        core: ConfigService,
+        limits: Arc<ApiLimits>,
+        metrics: Arc<ApiMetrics>,
+    ) -> Self {
+        Self { operations: Operations { core }, limits, metrics }
     }
 
     fn close<T: Message>(&self, call: &Call, done: Done<T>) -> Result<Response<T>, Status> {
@@ -110,7 +110,10 @@ impl Service {
 fn bounded<T: Message>(answer: Answer<T>) -> Done<T> {
     let bytes = answer.value.encoded_len();
     if bytes > MAX_MESSAGE_BYTES {
-        let detail = format!("the answer has {bytes} bytes and a message {MAX_MESSAGE_BYTES}; ask with a smaller page");
+        let detail = format!(
+            "the answer has {bytes} bytes and a message {MAX_MESSAGE_BYTES}; ask with a smaller \
+             page"
+        );
         return Err(Problem::new(Code::LimitExceeded, detail));
     }
     Ok(answer)
@@ -131,7 +134,8 @@ macro_rules! methods {
     ($($name:ident($request:ident) -> $response:ident;)+) => {
         #[tonic::async_trait]
         impl config_service_server::ConfigService for Service {
-            $(async fn $name(&self, request: Request<v1::$request>) -> Result<Response<v1::$response>, Status> {
+            $(async fn $name(&self,
+                request: Request<v1::$request>) -> Result<Response<v1::$response>, Status> {
                 let (mut call, message, _place) = self.open(request)?;
                 let done = self.operations.$name(&mut call, message).await;
                 self.close(&call, done)
@@ -139,7 +143,8 @@ macro_rules! methods {
 
             type WatchStream = watch::Responses;
 
-            async fn watch(&self, request: Request<v1::WatchRequest>) -> Result<Response<watch::Responses>, Status> {
+            async fn watch(&self,
+                request: Request<v1::WatchRequest>) -> Result<Response<watch::Responses>, Status> {
                 // Its stream needs no place any more.
                 let (call, message, _place) = self.open(request)?;
                 let opened = self.open_watch(&call, message).await;

@@ -1,6 +1,7 @@
 //! A refusal as a status of gRPC with the standard details: `ErrorInfo`, `BadRequest`, `RetryInfo`.
 //!
-//! Status and details travel in one header each, and some clients take no more than 8 KiB of headers: what is long is cut.
+//! Status and details travel in one header each, and some clients take no more than 8 KiB of
+//! headers: what is long is cut.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -60,7 +61,8 @@ fn violations(faults: &[FieldFault]) -> Vec<FieldViolation> {
     for fault in faults {
         let mut violation = FieldViolation::new(field(fault), cut(&fault.detail, MAX_FAULT_BYTES));
         violation.reason = fault.code.as_str().to_ascii_uppercase();
-        let bytes = violation.field.len() + violation.description.len() + violation.reason.len() + 8;
+        let bytes =
+            violation.field.len() + violation.description.len() + violation.reason.len() + 8;
         let Some(rest) = left.checked_sub(bytes) else { break };
         left = rest;
         out.push(violation);
@@ -118,11 +120,12 @@ mod tests {
 
     #[test]
     fn all_that_a_problem_says_is_in_the_details() {
-        let mut problem = Problem::faults(vec![fault(None, "no layer edge"), fault(Some(2), "no layer fog")])
-            .at(412)
-            .retry_after(3)
-            .applied(Applied::Unknown)
-            .because("only for the log");
+        let mut problem =
+            Problem::faults(vec![fault(None, "no layer edge"), fault(Some(2), "no layer fog")])
+                .at(412)
+                .retry_after(3)
+                .applied(Applied::Unknown)
+                .because("only for the log");
         problem.oldest_revision = Some(7);
         let status = from_problem(&problem, "r1");
         assert_eq!(status.message(), "/spec/layer: no layer edge (and 1 more)");
@@ -156,7 +159,9 @@ mod tests {
             problem.detail = detail;
             let response = from_problem(&problem, "r1").into_http::<String>();
             prop_assert_eq!(&response.headers()["content-type"], "application/grpc");
-            let bytes: usize = response.headers().iter().map(|(name, value)| name.as_str().len() + value.len()).sum();
+            let bytes: usize =
+                response.headers().iter().map(|(name, value)| name.as_str().len() + value.len())
+                .sum();
             prop_assert!(bytes < 8 * 1024, "{bytes}");
         }
     }

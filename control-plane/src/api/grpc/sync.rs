@@ -23,15 +23,16 @@ use super::{outgoing, status};
 use crate::api::limits::ApiLimits;
 use crate::api::request::client_address;
 use crate::core::{
-    Acknowledged, ConfigService, OLDEST_SYNC_PROTOCOL, RolloutReport, Running, RunningState, SYNC_PROTOCOL, SyncHello,
-    SyncItem, SyncStream, WorkerSession,
+    Acknowledged, ConfigService, OLDEST_SYNC_PROTOCOL, RolloutReport, Running, RunningState,
+    SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream, WorkerSession,
 };
 use crate::listen::Peer;
 use crate::metrics::ApiMetrics;
 
 /// How long a worker may take to say who it is.
 const GREETING: Duration = Duration::from_secs(10);
-/// When a worker that cannot be served is to come again, in ms: one of the two has to be updated first.
+/// When a worker that cannot be served is to come again, in ms: one of the two has to be updated
+/// first.
 const AGAIN_MS: u32 = 30_000;
 
 /// `blaze.v1.SyncService`.
@@ -42,7 +43,11 @@ pub(super) struct Service {
 }
 
 impl Service {
-    pub(super) fn new(core: ConfigService, limits: Arc<ApiLimits>, metrics: Arc<ApiMetrics>) -> Self {
+    pub(super) fn new(
+        core: ConfigService,
+        limits: Arc<ApiLimits>,
+        metrics: Arc<ApiMetrics>,
+    ) -> Self {
         Self { core, limits, metrics }
     }
 
@@ -50,20 +55,33 @@ impl Service {
         let caller = &call.caller;
         if gate::is_denial(problem) {
             let claims = Some(caller.claims.as_ref());
-            self.core
-                .denied(claims, problem, call.action, None, &caller.request_id, caller.address);
+            self.core.denied(
+                claims,
+                problem,
+                call.action,
+                None,
+                &caller.request_id,
+                caller.address,
+            );
         }
         status::from_problem(problem, &caller.request_id)
     }
 
-    async fn greet(&self, call: &Call, said: &mut Streaming<v1::SyncRequest>) -> Result<SyncHello, Status> {
+    async fn greet(
+        &self,
+        call: &Call,
+        said: &mut Streaming<v1::SyncRequest>,
+    ) -> Result<SyncHello, Status> {
         let first = tokio::time::timeout(GREETING, said.message()).await;
-        let refuse = |detail: &str| Err(self.refuse(call, &Problem::new(Code::InvalidRequest, detail)));
+        let refuse =
+            |detail: &str| Err(self.refuse(call, &Problem::new(Code::InvalidRequest, detail)));
         let Ok(first) = first else {
             return refuse("no Hello came within 10 s");
         };
         match first?.and_then(|request| request.msg) {
-            Some(Said::Hello(hello)) => read_hello(hello).map_err(|problem| self.refuse(call, &problem)),
+            Some(Said::Hello(hello)) => {
+                read_hello(hello).map_err(|problem| self.refuse(call, &problem))
+            }
             Some(Said::Ack(_)) | None => refuse("the first message must be Hello"),
         }
     }
@@ -76,9 +94,13 @@ type Responses = Pin<Box<dyn Stream<Item = Result<v1::SyncResponse, Status>> + S
 impl sync_service_server::SyncService for Service {
     type SyncStream = Responses;
 
-    async fn sync(&self, request: Request<Streaming<v1::SyncRequest>>) -> Result<Response<Responses>, Status> {
+    async fn sync(
+        &self,
+        request: Request<Streaming<v1::SyncRequest>>,
+    ) -> Result<Response<Responses>, Status> {
         let peer = request.extensions().get::<Peer>();
-        let is_safe = peer.is_some_and(|peer| peer.encrypted) || client_address(request.extensions()).is_loopback();
+        let is_safe = peer.is_some_and(|peer| peer.encrypted)
+            || client_address(request.extensions()).is_loopback();
         let (call, mut said) = Call::open(request)?;
         let slot = self
             .limits
@@ -97,13 +119,7 @@ impl sync_service_server::SyncService for Service {
         let opened = self.core.sync(&call.caller, hello, is_safe).await;
         let opened = opened.map_err(|problem| self.refuse(&call, &problem))?;
         let held = (slot, self.metrics.watcher());
-        Ok(Response::new(responses(
-            self.core.clone(),
-            opened,
-            said,
-            held,
-            call.caller.request_id,
-        )))
+        Ok(Response::new(responses(self.core.clone(), opened, said, held, call.caller.request_id)))
     }
 }
 
@@ -149,7 +165,11 @@ fn responses<H: Send + 'static>(
     Box::pin(told.filter_map(ready))
 }
 
-fn hear(core: &ConfigService, session: &WorkerSession, said: Result<v1::SyncRequest, Status>) -> Event {
+fn hear(
+    core: &ConfigService,
+    session: &WorkerSession,
+    said: Result<v1::SyncRequest, Status>,
+) -> Event {
     match said.map(|request| request.msg) {
         Ok(Some(Said::Ack(ack))) => {
             core.acknowledged(session, read_ack(ack));
@@ -170,31 +190,25 @@ fn hear(core: &ConfigService, session: &WorkerSession, said: Result<v1::SyncRequ
 /// `None`: the stream ends well.
 fn response(item: SyncItem, request_id: &str) -> Option<Result<v1::SyncResponse, Status>> {
     let told = match item {
-        SyncItem::Welcome {
-            protocol,
-            store_id,
-            revision,
-            resumed,
-        } => Told::Welcome(v1::Welcome {
-            protocol,
-            store_id,
-            revision,
-            resumed,
-        }),
-        SyncItem::Snapshot {
-            revision,
-            documents,
-            last,
-        } => Told::Snapshot(v1::Snapshot {
+        SyncItem::Welcome { protocol, store_id, revision, resumed } => {
+            Told::Welcome(v1::Welcome { protocol, store_id, revision, resumed })
+        }
+        SyncItem::Snapshot { revision, documents, last } => Told::Snapshot(v1::Snapshot {
             revision,
             documents: documents.iter().map(|document| outgoing::document(document)).collect(),
             last,
         }),
         SyncItem::Commit(commit) => Told::Commit(outgoing::commit(&commit)),
-        SyncItem::Bookmark { revision, digest } => Told::Bookmark(v1::Bookmark { revision, digest }),
-        SyncItem::GoAway { retry_after_ms, reason } => Told::GoAway(v1::GoAway { retry_after_ms, reason }),
+        SyncItem::Bookmark { revision, digest } => {
+            Told::Bookmark(v1::Bookmark { revision, digest })
+        }
+        SyncItem::GoAway { retry_after_ms, reason } => {
+            Told::GoAway(v1::GoAway { retry_after_ms, reason })
+        }
         SyncItem::End(None) => return None,
-        SyncItem::End(Some(problem)) => return Some(Err(status::from_problem(&problem, request_id))),
+        SyncItem::End(Some(problem)) => {
+            return Some(Err(status::from_problem(&problem, request_id)));
+        }
     };
     Some(Ok(v1::SyncResponse { msg: Some(told) }))
 }
@@ -210,10 +224,7 @@ fn read_hello(hello: v1::Hello) -> Result<SyncHello, Problem> {
     };
     Ok(SyncHello {
         protocol: hello.protocol,
-        layer: hello
-            .layer
-            .parse()
-            .map_err(|error| refuse("layer", format!("{error}")))?,
+        layer: hello.layer.parse().map_err(|error| refuse("layer", format!("{error}")))?,
         node,
         worker_id: hello.worker_id,
         version: hello.version,
@@ -224,14 +235,15 @@ fn read_hello(hello: v1::Hello) -> Result<SyncHello, Problem> {
     })
 }
 
-/// Why a worker cannot be served: it may be one version older than this service, or one newer, for then it speaks this
-/// version, too. Others could be misunderstood.
+/// Why a worker cannot be served: it may be one version older than this service, or one newer, for
+/// then it speaks this version, too. Others could be misunderstood.
 fn too_far_apart(hello: &SyncHello) -> Option<String> {
     let (oldest, newest) = (OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL + 1);
     let is_served = hello.protocol == 0 || (oldest..=newest).contains(&hello.protocol);
     (!is_served).then(|| {
         format!(
-            "version {} of the protocol of Sync is not spoken here, but those of workers from {oldest} to {newest}: update \
+            "version {} of the protocol of Sync is not spoken here, but those of workers from \
+             {oldest} to {newest}: update \
              the older of the two",
             hello.protocol
         )
@@ -240,10 +252,7 @@ fn too_far_apart(hello: &SyncHello) -> Option<String> {
 
 /// Tells a worker to come again later, and nothing else.
 fn sent_away(reason: String) -> Responses {
-    let go_away = SyncItem::GoAway {
-        retry_after_ms: AGAIN_MS,
-        reason,
-    };
+    let go_away = SyncItem::GoAway { retry_after_ms: AGAIN_MS, reason };
     Box::pin(stream::iter(response(go_away, "")))
 }
 

@@ -17,7 +17,8 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 use tonic_reflection::pb::v1::{
-    ServerReflectionRequest, ServerReflectionResponse, server_reflection_request, server_reflection_response,
+    ServerReflectionRequest, ServerReflectionResponse, server_reflection_request,
+    server_reflection_response,
 };
 use tonic_types::StatusExt as _;
 
@@ -38,11 +39,8 @@ async fn no_method_answers_without_a_good_token() {
     let good = fixture.token("admin", 3600);
     let forged = format!("Bearer {good}x");
     let mut messages = std::collections::BTreeSet::new();
-    for name in service
-        .method
-        .iter()
-        .map(google::MethodDescriptorProto::name)
-        .chain(["NoSuchMethod"])
+    for name in
+        service.method.iter().map(google::MethodDescriptorProto::name).chain(["NoSuchMethod"])
     {
         let path = format!("{PATH}{name}");
         for headers in [
@@ -87,11 +85,7 @@ async fn a_role_opens_what_its_rights_say() {
             assert!(posted.headers.contains_key("blaze-revision"), "{}", method.name);
         }
         let posted = fixture
-            .post(
-                &format!("{PATH}NoSuchMethod"),
-                &[("authorization", token.as_str())],
-                &[],
-            )
+            .post(&format!("{PATH}NoSuchMethod"), &[("authorization", token.as_str())], &[])
             .await;
         assert_eq!(posted.status.code(), tonic::Code::Unimplemented);
     }
@@ -102,18 +96,13 @@ async fn a_document_lives_its_life() {
     let fixture = Fixture::open().await;
     let mut client = fixture.client();
     let mut request = Request::new(create("edge", ""));
-    request
-        .metadata_mut()
-        .insert("x-request-id", "from-a-test".parse().unwrap());
+    request.metadata_mut().insert("x-request-id", "from-a-test".parse().unwrap());
     let created = client.create(request).await.unwrap();
     assert_eq!(created.metadata().get("x-request-id").unwrap(), "from-a-test");
     assert_eq!(created.metadata().get("blaze-revision").unwrap(), "1");
     let created = created.into_inner();
     assert_eq!((created.revision, created.updated_by.as_str()), (1, "dev"));
-    assert_eq!(
-        code(&client.create(create("edge", "")).await.unwrap_err()),
-        Code::AlreadyExists
-    );
+    assert_eq!(code(&client.create(create("edge", "")).await.unwrap_err()), Code::AlreadyExists);
 
     let replace = |precondition| v1::ReplaceRequest {
         document: layer("edge", r#"{"kind":"fog"}"#),
@@ -125,19 +114,13 @@ async fn a_document_lives_its_life() {
         (tonic::Code::FailedPrecondition, Code::PreconditionRequired)
     );
     let refused = client.replace(replace(exactly(9))).await.unwrap_err();
-    assert_eq!(
-        (refused.code(), code(&refused)),
-        (tonic::Code::Aborted, Code::PreconditionFailed)
-    );
+    assert_eq!((refused.code(), code(&refused)), (tonic::Code::Aborted, Code::PreconditionFailed));
     let info = refused.get_details_error_info().unwrap();
     assert_eq!(
         (info.metadata["revision"].as_str(), info.metadata["applied"].as_str()),
         ("1", "no")
     );
-    assert_eq!(
-        client.replace(replace(exactly(1))).await.unwrap().into_inner().revision,
-        2
-    );
+    assert_eq!(client.replace(replace(exactly(1))).await.unwrap().into_inner().revision, 2);
 
     let patch = v1::PatchRequest {
         r#ref: reference(v1::Kind::Layer, "edge"),
@@ -153,10 +136,7 @@ async fn a_document_lives_its_life() {
         ..Default::default()
     };
     let list = client.list(list).await.unwrap().into_inner();
-    assert_eq!(
-        (list.items, list.revision, list.next_page_token.as_str()),
-        (vec![patched], 3, "")
-    );
+    assert_eq!((list.items, list.revision, list.next_page_token.as_str()), (vec![patched], 3, ""));
 
     let history = v1::ListHistoryRequest {
         r#ref: reference(v1::Kind::Layer, "edge"),
@@ -185,10 +165,7 @@ async fn a_document_lives_its_life() {
         cascade: false,
     };
     assert_eq!(client.delete(delete).await.unwrap().into_inner().revision, 4);
-    let get = v1::GetRequest {
-        r#ref: reference(v1::Kind::Layer, "edge"),
-        read: None,
-    };
+    let get = v1::GetRequest { r#ref: reference(v1::Kind::Layer, "edge"), read: None };
     assert_eq!(code(&client.get(get).await.unwrap_err()), Code::NotFound);
     let text = fixture.metrics.text();
     let line = r#"blaze_config_requests_total{api="grpc",code="precondition_failed",operation="Replace"} 1"#;
@@ -199,10 +176,7 @@ async fn a_document_lives_its_life() {
 async fn apply_is_one_commit_and_tells_where_it_failed() {
     let fixture = Fixture::open().await;
     let mut client = fixture.client();
-    let item = |document| v1::ApplyItem {
-        document,
-        delete: false,
-    };
+    let item = |document| v1::ApplyItem { document, delete: false };
     let node = |layer: &str| {
         Some(v1::Document {
             r#ref: reference(v1::Kind::Node, "robot-1"),
@@ -221,11 +195,8 @@ async fn apply_is_one_commit_and_tells_where_it_failed() {
 
     let answer = client.apply(apply(node("edge"))).await.unwrap().into_inner();
     assert_eq!((answer.revision, answer.dry_run), (1, false));
-    let results: Vec<_> = answer
-        .results
-        .iter()
-        .map(|result| (result.op(), result.revision))
-        .collect();
+    let results: Vec<_> =
+        answer.results.iter().map(|result| (result.op(), result.revision)).collect();
     assert_eq!(results, [(v1::Op::Create, 1), (v1::Op::Create, 1)]);
     let again = client.apply(apply(node("edge"))).await.unwrap().into_inner();
     assert!(again.results.iter().all(|result| result.op() == v1::Op::Unchanged));
@@ -253,10 +224,7 @@ async fn a_watch_tells_every_commit_after_its_start() {
     let fixture = Fixture::open().await;
     let mut client = fixture.client();
     client.create(create("edge", "")).await.unwrap();
-    let watch = v1::WatchRequest {
-        since: Some(0),
-        ..Default::default()
-    };
+    let watch = v1::WatchRequest { since: Some(0), ..Default::default() };
     let mut stream = client.watch(watch).await.unwrap().into_inner();
     client.create(create("fog", "")).await.unwrap();
     let mut commits = Vec::new();
@@ -265,17 +233,11 @@ async fn a_watch_tells_every_commit_after_its_start() {
             commits.push(commit);
         }
     }
-    let chain: Vec<_> = commits
-        .iter()
-        .map(|commit| (commit.previous, commit.revision))
-        .collect();
+    let chain: Vec<_> = commits.iter().map(|commit| (commit.previous, commit.revision)).collect();
     assert_eq!(chain, [(0, 1), (1, 2)]);
     let change = &commits[1].changes[0];
     assert_eq!(change.op(), v1::Op::Create);
-    assert_eq!(
-        change.document.as_ref().unwrap().r#ref,
-        reference(v1::Kind::Layer, "fog")
-    );
+    assert_eq!(change.document.as_ref().unwrap().r#ref, reference(v1::Kind::Layer, "fog"));
     assert!(fixture.metrics.text().contains("blaze_config_watchers 1"));
     drop(stream);
     assert!(fixture.metrics.text().contains("blaze_config_watchers 0"));
@@ -286,10 +248,7 @@ async fn a_call_ends_with_its_time() {
     let fixture = Fixture::open().await;
     let mut get = Request::new(v1::GetRequest {
         r#ref: reference(v1::Kind::Layer, "edge"),
-        read: Some(v1::ReadOptions {
-            min_revision: 1_000,
-            ..Default::default()
-        }),
+        read: Some(v1::ReadOptions { min_revision: 1_000, ..Default::default() }),
     });
     get.set_timeout(Duration::from_millis(50));
     let refused = fixture.client().get(get).await.unwrap_err();
@@ -323,39 +282,25 @@ async fn what_cannot_be_read_is_refused_with_details() {
         ("Get", v1::GetRequest::default().encode_to_vec(), Code::InvalidRequest),
         (
             "List",
-            v1::ListRequest {
-                kind: 99,
-                ..Default::default()
-            }
-            .encode_to_vec(),
+            v1::ListRequest { kind: 99, ..Default::default() }.encode_to_vec(),
             Code::InvalidRequest,
         ),
         ("List", v1::ListRequest::default().encode_to_vec(), Code::InvalidRequest),
         (
             "ListAudit",
-            v1::ListAuditRequest {
-                filter_json: r#"{"a":"b"}"#.into(),
-                page: None,
-            }
-            .encode_to_vec(),
+            v1::ListAuditRequest { filter_json: r#"{"a":"b"}"#.into(), page: None }.encode_to_vec(),
             Code::UnknownParameter,
         ),
         (
             "Create",
-            v1::CreateRequest {
-                document: layer("Edge", "{}"),
-                request_id: String::new(),
-            }
-            .encode_to_vec(),
+            v1::CreateRequest { document: layer("Edge", "{}"), request_id: String::new() }
+                .encode_to_vec(),
             Code::ValidationFailed,
         ),
         (
             "Create",
-            v1::CreateRequest {
-                document: layer("edge", "{"),
-                request_id: String::new(),
-            }
-            .encode_to_vec(),
+            v1::CreateRequest { document: layer("edge", "{"), request_id: String::new() }
+                .encode_to_vec(),
             Code::InvalidRequest,
         ),
         (
@@ -380,15 +325,9 @@ async fn revision_zero_is_none() {
     let mut client = fixture.client();
     client.create(create("edge", "")).await.unwrap();
     let edge = || reference(v1::Kind::Layer, "edge");
-    let diff = client.diff(v1::DiffRequest {
-        r#ref: edge(),
-        ..Default::default()
-    });
+    let diff = client.diff(v1::DiffRequest { r#ref: edge(), ..Default::default() });
     let diff = diff.await.unwrap_err();
-    let rollback = client.rollback(v1::RollbackRequest {
-        r#ref: edge(),
-        ..Default::default()
-    });
+    let rollback = client.rollback(v1::RollbackRequest { r#ref: edge(), ..Default::default() });
     let rollback = rollback.await.unwrap_err();
     let revert = client.revert(v1::RevertRequest::default()).await.unwrap_err();
     for refused in [diff, rollback, revert] {
@@ -441,12 +380,8 @@ async fn what_is_not_there_is_told_like_other_refusals() {
         );
         assert_eq!(posted.headers["x-request-id"], "from-a-test", "{path}");
     }
-    let unknown = HealthCheckRequest {
-        service: "blaze.v1.Other".into(),
-    };
-    let posted = fixture
-        .post("/grpc.health.v1.Health/Check", &[], &unknown.encode_to_vec())
-        .await;
+    let unknown = HealthCheckRequest { service: "blaze.v1.Other".into() };
+    let posted = fixture.post("/grpc.health.v1.Health/Check", &[], &unknown.encode_to_vec()).await;
     assert_eq!(
         (posted.status.code(), code(&posted.status)),
         (tonic::Code::NotFound, Code::NotFound)
@@ -471,20 +406,13 @@ async fn health_needs_no_token_and_follows_readiness() {
     let fixture = Fixture::guarded().await;
     let mut client = HealthClient::new(fixture.router.clone());
     let mut status = async || {
-        let request = HealthCheckRequest {
-            service: "blaze.v1.ConfigService".into(),
-        };
-        client
-            .check(request)
-            .await
-            .map(|answer| HealthCheckResponse::status(answer.get_ref()))
+        let request = HealthCheckRequest { service: "blaze.v1.ConfigService".into() };
+        client.check(request).await.map(|answer| HealthCheckResponse::status(answer.get_ref()))
     };
     fixture.readiness.set("test", CheckStatus::Ok, "");
     let is_ready = fixture.readiness.is_ready();
     assert_eq!(status().await.unwrap() == ServingStatus::Serving, is_ready);
-    fixture
-        .readiness
-        .add("test", Deciding::Decides, CheckStatus::Failed, "as the test wants it");
+    fixture.readiness.add("test", Deciding::Decides, CheckStatus::Failed, "as the test wants it");
     assert_eq!(status().await.unwrap(), ServingStatus::NotServing);
 }
 
@@ -492,7 +420,9 @@ async fn health_needs_no_token_and_follows_readiness() {
 async fn reflection_is_there_only_when_it_is_switched_on() {
     let list = ServerReflectionRequest {
         host: String::new(),
-        message_request: Some(server_reflection_request::MessageRequest::ListServices(String::new())),
+        message_request: Some(server_reflection_request::MessageRequest::ListServices(
+            String::new(),
+        )),
     };
     let guarded = Fixture::guarded().await;
     let posted = guarded.post(REFLECTION, &[], &list.encode_to_vec()).await;
@@ -502,15 +432,15 @@ async fn reflection_is_there_only_when_it_is_switched_on() {
     let posted = open.post(REFLECTION, &[], &list.encode_to_vec()).await;
     assert_eq!(posted.status.code(), tonic::Code::Ok);
     let answer = ServerReflectionResponse::decode(&posted.body[5..]).unwrap();
-    let Some(server_reflection_response::MessageResponse::ListServicesResponse(list)) = answer.message_response else {
+    let Some(server_reflection_response::MessageResponse::ListServicesResponse(list)) =
+        answer.message_response
+    else {
         panic!("{answer:?}");
     };
     let names: Vec<_> = list.service.iter().map(|service| service.name.as_str()).collect();
-    for name in [
-        "blaze.v1.ConfigService",
-        "grpc.health.v1.Health",
-        "grpc.reflection.v1.ServerReflection",
-    ] {
+    for name in
+        ["blaze.v1.ConfigService", "grpc.health.v1.Health", "grpc.reflection.v1.ServerReflection"]
+    {
         assert!(names.contains(&name), "{names:?}");
     }
 }

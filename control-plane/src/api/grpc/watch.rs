@@ -27,9 +27,8 @@ where
     S: Stream<Item = WatchItem> + Send + 'static,
     H: Send + 'static,
 {
-    let responses = items.scan((held, request_id), |(_, request_id), item| {
-        ready(response(item, request_id))
-    });
+    let responses =
+        items.scan((held, request_id), |(_, request_id), item| ready(response(item, request_id)));
     Box::pin(responses)
 }
 
@@ -39,7 +38,9 @@ fn response(item: WatchItem, request_id: &str) -> Option<Result<v1::WatchRespons
         WatchItem::Commit(commit) => Event::Commit(outgoing::commit(&commit)),
         WatchItem::Bookmark(revision) => Event::Bookmark(revision),
         WatchItem::End(None) => return None,
-        WatchItem::End(Some(problem)) => return Some(Err(status::from_problem(&problem, request_id))),
+        WatchItem::End(Some(problem)) => {
+            return Some(Err(status::from_problem(&problem, request_id)));
+        }
     };
     Some(Ok(v1::WatchResponse { event: Some(event) }))
 }
@@ -55,7 +56,9 @@ mod tests {
 
     #[tokio::test]
     async fn a_stream_ends_well_or_with_its_reason_and_frees_its_place() {
-        let items = |end| stream::iter([WatchItem::Bookmark(7), WatchItem::End(end), WatchItem::Bookmark(8)]);
+        let items = |end| {
+            stream::iter([WatchItem::Bookmark(7), WatchItem::End(end), WatchItem::Bookmark(8)])
+        };
 
         let all: Vec<_> = responses(items(None), (), "r1".into()).collect().await;
         let [Ok(only)] = all.as_slice() else {

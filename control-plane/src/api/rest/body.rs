@@ -41,9 +41,12 @@ impl Payload {
             Self::None => &[],
             Self::MergePatch => &[Media::MergePatch, Media::Json],
             Self::Documents => &[Media::Yaml, Media::Json],
-            Self::Document(_) | Self::Rollback | Self::Revert | Self::Trim | Self::Token | Self::Abort => {
-                &[Media::Json]
-            }
+            Self::Document(_)
+            | Self::Rollback
+            | Self::Revert
+            | Self::Trim
+            | Self::Token
+            | Self::Abort => &[Media::Json],
         }
     }
 
@@ -58,15 +61,19 @@ impl Payload {
 /// Reads a body: `None` where the route has none.
 ///
 /// # Errors
-/// `payload_too_large`, `unsupported_media_type`, `invalid_request` if it breaks off, and what the limits of bodies refuse.
-pub(super) async fn read(payload: Payload, headers: &HeaderMap, body: Body) -> Result<Option<(Media, Bytes)>, Problem> {
+/// `payload_too_large`, `unsupported_media_type`, `invalid_request` if it breaks off, and what the
+/// limits of bodies refuse.
+pub(super) async fn read(
+    payload: Payload,
+    headers: &HeaderMap,
+    body: Body,
+) -> Result<Option<(Media, Bytes)>, Problem> {
     if payload == Payload::None {
         return Ok(None);
     }
     let limit = payload.limit();
-    let announced = headers
-        .get(CONTENT_LENGTH)
-        .and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
+    let announced =
+        headers.get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
     if announced.is_some_and(|length| length > limit) {
         return Err(too_large(limit));
     }
@@ -107,22 +114,16 @@ fn media_type(payload: Payload, headers: &HeaderMap) -> Result<Media, Problem> {
     let text = value.to_str().map_err(|_| refuse("the Content-Type cannot be read"))?;
     let mut parts = text.split(';').map(str::trim);
     let name = parts.next().unwrap_or_default();
-    let Some(media) = taken
-        .iter()
-        .copied()
-        .find(|media| media.as_str().eq_ignore_ascii_case(name))
+    let Some(media) = taken.iter().copied().find(|media| media.as_str().eq_ignore_ascii_case(name))
     else {
         return Err(refuse("the body has another Content-Type"));
     };
     let utf8 = parts.filter(|part| !part.is_empty()).all(|part| {
         let (name, value) = part.split_once('=').unwrap_or((part, ""));
-        !name.trim().eq_ignore_ascii_case("charset") || value.trim().trim_matches('"').eq_ignore_ascii_case("utf-8")
+        !name.trim().eq_ignore_ascii_case("charset")
+            || value.trim().trim_matches('"').eq_ignore_ascii_case("utf-8")
     });
-    if utf8 {
-        Ok(media)
-    } else {
-        Err(refuse("the charset is not utf-8"))
-    }
+    if utf8 { Ok(media) } else { Err(refuse("the charset is not utf-8")) }
 }
 
 /// Reads strict JSON.
@@ -154,7 +155,8 @@ mod tests {
     }
 
     fn code(payload: Payload, content_type: &str) -> Result<Media, Code> {
-        media_type(payload, &headers(&[(CONTENT_TYPE, content_type)])).map_err(|problem| problem.code)
+        media_type(payload, &headers(&[(CONTENT_TYPE, content_type)]))
+            .map_err(|problem| problem.code)
     }
 
     #[test]
@@ -184,7 +186,8 @@ mod tests {
             assert_eq!(code(document, bad), Err(Code::UnsupportedMediaType), "{bad}");
         }
         assert!(media_type(document, &HeaderMap::new()).is_err());
-        let twice = headers(&[(CONTENT_TYPE, "application/json"), (CONTENT_TYPE, "application/json")]);
+        let twice =
+            headers(&[(CONTENT_TYPE, "application/json"), (CONTENT_TYPE, "application/json")]);
         assert!(media_type(document, &twice).is_err());
         let packed = headers(&[(CONTENT_TYPE, "application/json"), (CONTENT_ENCODING, "gzip")]);
         assert!(media_type(document, &packed).is_err());
@@ -201,14 +204,8 @@ mod tests {
                     .map_err(|problem| problem.code)
             }
         };
-        assert_eq!(
-            read_bytes(Payload::Trim, MAX_BODY).await.unwrap().unwrap().1.len(),
-            MAX_BODY
-        );
-        assert_eq!(
-            read_bytes(Payload::Trim, MAX_BODY + 1).await,
-            Err(Code::PayloadTooLarge)
-        );
+        assert_eq!(read_bytes(Payload::Trim, MAX_BODY).await.unwrap().unwrap().1.len(), MAX_BODY);
+        assert_eq!(read_bytes(Payload::Trim, MAX_BODY + 1).await, Err(Code::PayloadTooLarge));
         assert!(read_bytes(Payload::Documents, MAX_BODY + 1).await.is_ok());
         assert_eq!(read_bytes(Payload::None, MAX_BODY + 1).await, Ok(None));
         let announced = headers(&[(CONTENT_TYPE, "text/plain"), (CONTENT_LENGTH, "1048577")]);

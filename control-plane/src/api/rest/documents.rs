@@ -47,10 +47,7 @@ pub(super) async fn create(call: &Call, kind: Kind) -> Result<Response, Problem>
 /// `GET /{c}/{n}`
 pub(super) async fn get(call: &Call, kind: Kind) -> Result<Response, Problem> {
     let known = headers::if_none_match(&call.headers)?;
-    let answer = call
-        .service()
-        .get(&call.caller, &call.key(kind)?, &call.read_options()?)
-        .await?;
+    let answer = call.service().get(&call.caller, &call.key(kind)?, &call.read_options()?).await?;
     let revision = answer.value.revision;
     let unchanged = match known {
         None => false,
@@ -71,7 +68,11 @@ pub(super) async fn replace(call: &Call, kind: Kind) -> Result<Response, Problem
     let precondition = headers::put_precondition(&call.headers)?;
     let input = match spec::parse_envelope(call.json()?, Some(&key)).and_then(input) {
         Ok(input) => input,
-        Err(faults) => return Err(precondition_first(call, &key, &precondition, Problem::faults(faults)).await),
+        Err(faults) => {
+            return Err(
+                precondition_first(call, &key, &precondition, Problem::faults(faults)).await
+            );
+        }
     };
     let answer = call.service().replace(&call.caller, input, precondition).await?;
     Ok(reply::written(&answer))
@@ -80,10 +81,8 @@ pub(super) async fn replace(call: &Call, kind: Kind) -> Result<Response, Problem
 /// `PATCH /{c}/{n}`
 pub(super) async fn patch(call: &Call, kind: Kind) -> Result<Response, Problem> {
     let precondition = headers::precondition(&call.headers)?;
-    let answer = call
-        .service()
-        .patch(&call.caller, &call.key(kind)?, call.json()?, precondition)
-        .await?;
+    let answer =
+        call.service().patch(&call.caller, &call.key(kind)?, call.json()?, precondition).await?;
     Ok(reply::written(&answer))
 }
 
@@ -91,20 +90,16 @@ pub(super) async fn patch(call: &Call, kind: Kind) -> Result<Response, Problem> 
 pub(super) async fn delete(call: &Call, kind: Kind) -> Result<Response, Problem> {
     let precondition = headers::precondition(&call.headers)?;
     let cascade = call.query.flag(Param::Cascade)?;
-    let answer = call
-        .service()
-        .delete(&call.caller, &call.key(kind)?, precondition, cascade)
-        .await?;
+    let answer =
+        call.service().delete(&call.caller, &call.key(kind)?, precondition, cascade).await?;
     Ok(reply::empty(StatusCode::NO_CONTENT, answer.revision))
 }
 
 /// `POST /rollouts/{n}/promote`
 pub(super) async fn promote(call: &Call) -> Result<Response, Problem> {
     let key = call.key(Kind::Rollout)?;
-    let answer = call
-        .service()
-        .promote_rollout(&call.caller, key.name(), call.idempotency()?)
-        .await?;
+    let answer =
+        call.service().promote_rollout(&call.caller, key.name(), call.idempotency()?).await?;
     Ok(reply::written(&answer))
 }
 
@@ -112,10 +107,8 @@ pub(super) async fn promote(call: &Call) -> Result<Response, Problem> {
 pub(super) async fn abort(call: &Call) -> Result<Response, Problem> {
     let (key, idempotency) = (call.key(Kind::Rollout)?, call.idempotency()?);
     let AbortRequest { reason } = call.read()?;
-    let answer = call
-        .service()
-        .abort_rollout(&call.caller, key.name(), &reason, idempotency)
-        .await?;
+    let answer =
+        call.service().abort_rollout(&call.caller, key.name(), &reason, idempotency).await?;
     Ok(reply::written(&answer))
 }
 
@@ -133,31 +126,29 @@ fn input(envelope: Envelope) -> Result<DocumentInput, Vec<FieldFault>> {
 pub(super) fn apply_item(value: Value) -> Result<ApplyItem, Vec<FieldFault>> {
     let envelope = spec::parse_envelope(value, None)?;
     let (revision, delete) = (envelope.revision, envelope.delete);
-    Ok(ApplyItem {
-        input: input(envelope)?,
-        revision,
-        delete,
-    })
+    Ok(ApplyItem { input: input(envelope)?, revision, delete })
 }
 
-/// The order of checks has preconditions before faults of the document; the core sees only documents without faults, so
-/// that what comes first is looked up here.
-async fn precondition_first(call: &Call, key: &Key, precondition: &Precondition, faults: Problem) -> Problem {
-    let read = |caller: Caller| async move { call.service().get(&caller, key, &ReadOptions::default()).await };
+/// The order of checks has preconditions before faults of the document; the core sees only
+/// documents without faults, so that what comes first is looked up here.
+async fn precondition_first(
+    call: &Call,
+    key: &Key,
+    precondition: &Precondition,
+    faults: Problem,
+) -> Problem {
+    let read = |caller: Caller| async move {
+        call.service().get(&caller, key, &ReadOptions::default()).await
+    };
     let mut found = read(call.caller.clone()).await;
     if let Err(refused) = &found
         && refused.code == Code::PermissionDenied
         && may_create(key, precondition)
     {
-        // A token bound to a layer may make what does not exist; whether it does, the token's own view does not say.
-        let whole = Claims {
-            layer: None,
-            ..(*call.caller.claims).clone()
-        };
-        let caller = Caller {
-            claims: Arc::new(whole),
-            ..call.caller.clone()
-        };
+        // A token bound to a layer may make what does not exist; whether it does, the token's own
+        // view does not say.
+        let whole = Claims { layer: None, ..(*call.caller.claims).clone() };
+        let caller = Caller { claims: Arc::new(whole), ..call.caller.clone() };
         match read(caller).await {
             Err(problem) if problem.code == Code::NotFound => found = Err(problem),
             Ok(_) | Err(_) => {}
@@ -176,11 +167,19 @@ fn may_create(key: &Key, precondition: &Precondition) -> bool {
     key.kind() != Kind::Service && matches!(precondition, Precondition::None | Precondition::Absent)
 }
 
-/// What a precondition says of the present revision, if it refuses; of what is missing, that of the store is told.
-fn judge(key: &Key, precondition: &Precondition, current: Option<u64>, store: u64) -> Option<Problem> {
+/// What a precondition says of the present revision, if it refuses; of what is missing, that of the
+/// store is told.
+fn judge(
+    key: &Key,
+    precondition: &Precondition,
+    current: Option<u64>,
+    store: u64,
+) -> Option<Problem> {
     let (code, detail) = match (precondition, current) {
         (Precondition::None, Some(_)) => {
-            let detail = format!("{key} exists: say which revision you change with If-Match (its ETag), or * for any");
+            let detail = format!(
+                "{key} exists: say which revision you change with If-Match (its ETag), or * for any"
+            );
             (Code::PreconditionRequired, detail)
         }
         (Precondition::Revisions(wanted), Some(revision)) if !wanted.contains(&revision) => {
@@ -208,36 +207,37 @@ mod tests {
     #[test]
     fn preconditions_are_judged_as_the_core_does() {
         let key: Key = "Node/robot-1".parse().unwrap();
-        let code = |precondition, current| judge(&key, &precondition, current, 9).map(|problem| problem.code);
+        let code = |precondition, current| {
+            judge(&key, &precondition, current, 9).map(|problem| problem.code)
+        };
         assert_eq!(code(Precondition::None, None), None);
         assert_eq!(code(Precondition::None, Some(7)), Some(Code::PreconditionRequired));
         assert_eq!(code(Precondition::Any, Some(7)), None);
         assert_eq!(code(Precondition::Any, None), Some(Code::PreconditionFailed));
         assert_eq!(code(Precondition::Revisions(vec![6, 7]), Some(7)), None);
-        assert_eq!(
-            code(Precondition::Revisions(vec![6]), Some(7)),
-            Some(Code::PreconditionFailed)
-        );
-        assert_eq!(
-            code(Precondition::Revisions(vec![6]), None),
-            Some(Code::PreconditionFailed)
-        );
+        assert_eq!(code(Precondition::Revisions(vec![6]), Some(7)), Some(Code::PreconditionFailed));
+        assert_eq!(code(Precondition::Revisions(vec![6]), None), Some(Code::PreconditionFailed));
         assert_eq!(code(Precondition::Absent, None), None);
         assert_eq!(code(Precondition::Absent, Some(7)), Some(Code::PreconditionFailed));
-        let revision = |precondition, current| judge(&key, &precondition, current, 9).unwrap().revision;
+        let revision =
+            |precondition, current| judge(&key, &precondition, current, 9).unwrap().revision;
         assert_eq!(revision(Precondition::None, Some(7)), Some(7));
         assert_eq!(revision(Precondition::Any, None), Some(9));
     }
 
     #[test]
     fn an_item_of_apply_says_what_it_is() {
-        let item = apply_item(json!({ "kind": "Node", "name": "robot-1", "revision": 7, "spec": { "layer": "edge" } }))
-            .unwrap();
+        let item = apply_item(json!({ "kind": "Node", "name": "robot-1", "revision": 7,
+            "spec": { "layer": "edge" } }))
+        .unwrap();
         assert_eq!(
             (item.input.key.to_string().as_str(), item.revision, item.delete),
             ("Node/robot-1", Some(7), false)
         );
-        let gone = apply_item(json!({ "kind": "Instance", "service": "slam", "name": "0", "delete": true })).unwrap();
+        let gone = apply_item(
+            json!({ "kind": "Instance", "service": "slam", "name": "0", "delete": true }),
+        )
+        .unwrap();
         assert!(gone.delete);
         assert!(apply_item(json!({ "name": "robot-1", "spec": {} })).is_err());
     }

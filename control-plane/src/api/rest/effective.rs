@@ -19,10 +19,8 @@ pub(super) async fn get(call: &Call) -> Result<Response, Problem> {
         node: call.query.name(Param::AtNode)?,
     };
     let explain = call.query.flag(Param::Explain)?;
-    let answer = call
-        .service()
-        .effective(&call.caller, &place, explain, &call.read_options()?)
-        .await?;
+    let answer =
+        call.service().effective(&call.caller, &place, explain, &call.read_options()?).await?;
     let body = json::effective(&answer.value, answer.revision);
     Ok(reply::json(StatusCode::OK, answer.revision, &body))
 }

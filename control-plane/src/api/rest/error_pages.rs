@@ -39,10 +39,7 @@ fn html(text: &str) -> String {
 }
 
 fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;")
-        .replace('"', "&quot;")
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 /// The page of one code.
@@ -63,9 +60,12 @@ pub(super) fn index() -> String {
     let rows: String = Code::ALL
         .iter()
         .map(|code| {
-            let status = code.http_status().map_or_else(|| "–".to_owned(), |status| status.to_string());
+            let status =
+                code.http_status().map_or_else(|| "–".to_owned(), |status| status.to_string());
             let title = escaped(code.title());
-            format!("<tr><td><a href=\"/docs/errors/{code}\"><code>{code}</code></a></td><td>{status}</td><td>{title}</td></tr>\n")
+            format!(
+                "<tr><td><a href=\"/docs/errors/{code}\"><code>{code}</code></a></td><td>{status}</td><td>{title}</td></tr>\n",
+            )
         })
         .collect();
     format!(

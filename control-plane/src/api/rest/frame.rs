@@ -1,4 +1,5 @@
-//! What every request and every answer has: an id, a time limit, a line in the log, a count, and some headers.
+//! What every request and every answer has: an id, a time limit, a line in the log, a count, and
+//! some headers.
 
 use std::net::IpAddr;
 use std::panic::AssertUnwindSafe;
@@ -50,7 +51,12 @@ pub(super) fn note(response: &mut Response, change: impl FnOnce(&mut Served)) {
 }
 
 /// Answers a request, whatever happens to it.
-pub(super) async fn serve(rest: &Rest, api: Router, pages: Router, mut incoming: Request) -> Response {
+pub(super) async fn serve(
+    rest: &Rest,
+    api: Router,
+    pages: Router,
+    mut incoming: Request,
+) -> Response {
     let started = Instant::now();
     let visit = Visit {
         request_id: request::request_id(incoming.headers()).into(),
@@ -73,13 +79,10 @@ pub(super) async fn serve(rest: &Rest, api: Router, pages: Router, mut incoming:
 
 /// The message of the panic is in the log already, by the hook; nothing of it leaves the process.
 fn panicked(method: &Method) -> Problem {
-    let problem = Problem::new(Code::Internal, "the service failed at this request; the log says more")
-        .because("a handler panicked");
-    if method.is_safe() {
-        problem
-    } else {
-        problem.applied(Applied::Unknown)
-    }
+    let problem =
+        Problem::new(Code::Internal, "the service failed at this request; the log says more")
+            .because("a handler panicked");
+    if method.is_safe() { problem } else { problem.applied(Applied::Unknown) }
 }
 
 /// Headers of every answer; what a handler has set stays.
@@ -98,7 +101,8 @@ fn finish(response: &mut Response, visit: &Visit, trace: Option<HeaderValue>) {
     default(CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'");
 }
 
-/// One line and one count for each request. Nothing of query, headers or body: they may hold secrets.
+/// One line and one count for each request. Nothing of query, headers or body: they may hold
+/// secrets.
 fn record(rest: &Rest, response: &Response, visit: &Visit, method: &Method, started: Instant) {
     let took = started.elapsed();
     let served = response.extensions().get::<Served>();
@@ -108,9 +112,7 @@ fn record(rest: &Rest, response: &Response, visit: &Visit, method: &Method, star
     let code = refused.map_or("ok", |refused| refused.code.as_str());
     rest.options.metrics.observe("rest", operation, code, took);
     let status = response.status();
-    let internal = refused
-        .and_then(|refused| refused.internal.as_deref())
-        .unwrap_or_default();
+    let internal = refused.and_then(|refused| refused.internal.as_deref()).unwrap_or_default();
     let (request_id, duration_ms) = (&*visit.request_id, millis(took));
     let trace = response
         .headers()
@@ -121,13 +123,15 @@ fn record(rest: &Rest, response: &Response, visit: &Visit, method: &Method, star
     if status.is_server_error() {
         tracing::warn!(
             target: "blaze_config::access",
-            request_id, subject, operation, %method, path, status = status.as_u16(), code, duration_ms, %peer, trace, internal,
+            request_id, subject, operation, %method, path, status = status.as_u16(), code,
+            duration_ms, %peer, trace, internal,
             "request failed"
         );
     } else {
         tracing::info!(
             target: "blaze_config::access",
-            request_id, subject, operation, %method, path, status = status.as_u16(), code, duration_ms, %peer, trace, internal,
+            request_id, subject, operation, %method, path, status = status.as_u16(), code,
+            duration_ms, %peer, trace, internal,
             "request"
         );
     }
@@ -140,11 +144,7 @@ fn millis(took: Duration) -> f64 {
 
 /// `WWW-Authenticate` of a 401: with an error only if a token was sent.
 pub(super) fn challenge(response: &mut Response, sent: bool) {
-    let value = if sent {
-        "Bearer error=\"invalid_token\""
-    } else {
-        "Bearer"
-    };
+    let value = if sent { "Bearer error=\"invalid_token\"" } else { "Bearer" };
     reply::set(response, WWW_AUTHENTICATE, value);
 }
 

@@ -21,7 +21,13 @@ use crate::auth::Claims;
 pub(super) struct Known(pub(super) Arc<Claims>);
 
 /// Lets a request through to where its path leads, or refuses it.
-pub(super) async fn pass(rest: &Rest, api: Router, pages: Router, visit: &Visit, request: Request) -> Response {
+pub(super) async fn pass(
+    rest: &Rest,
+    api: Router,
+    pages: Router,
+    visit: &Visit,
+    request: Request,
+) -> Response {
     let refuse = |problem: &Problem| reply::problem(problem, &visit.path, &visit.request_id);
     if let Err(problem) = sizes(&request).and_then(|()| one_host(&request)) {
         return refuse(&problem);
@@ -29,8 +35,7 @@ pub(super) async fn pass(rest: &Rest, api: Router, pages: Router, visit: &Visit,
     if rest.options.dev
         && let Err(problem) = check_dev(request.uri(), request.headers())
     {
-        rest.service
-            .denied(None, &problem, "request", None, &visit.request_id, visit.address);
+        rest.service.denied(None, &problem, "request", None, &visit.request_id, visit.address);
         return refuse(&problem);
     }
     if !visit.path.starts_with("/api/") {
@@ -50,15 +55,20 @@ pub(super) async fn pass(rest: &Rest, api: Router, pages: Router, visit: &Visit,
                 if token.is_some() {
                     limits.count_refused_token(visit.address);
                 }
-                rest.service
-                    .denied(None, &problem, "authenticate", None, &visit.request_id, visit.address);
+                rest.service.denied(
+                    None,
+                    &problem,
+                    "authenticate",
+                    None,
+                    &visit.request_id,
+                    visit.address,
+                );
             }
             return response;
         }
     };
-    let mut response = within_limits(rest, api, &claims, request)
-        .await
-        .unwrap_or_else(|problem| refuse(&problem));
+    let mut response =
+        within_limits(rest, api, &claims, request).await.unwrap_or_else(|problem| refuse(&problem));
     if !response.headers().contains_key(BLAZE_REVISION) {
         reply::set(&mut response, BLAZE_REVISION, &rest.service.revision().to_string());
     }
@@ -88,18 +98,21 @@ async fn route(router: Router, request: Request) -> Response {
 fn sizes(request: &Request) -> Result<(), Problem> {
     let bytes = header_bytes(request.headers());
     if bytes > MAX_HEADER_BYTES {
-        let detail = format!("the headers have {bytes} bytes, at most {MAX_HEADER_BYTES} are allowed");
+        let detail =
+            format!("the headers have {bytes} bytes, at most {MAX_HEADER_BYTES} are allowed");
         return Err(Problem::new(Code::HeadersTooLarge, detail));
     }
     let uri = request.uri().path_and_query().map_or(0, |path| path.as_str().len());
     if uri > MAX_URI_BYTES {
-        let detail = format!("path and query have {uri} bytes, at most {MAX_URI_BYTES} are allowed");
+        let detail =
+            format!("path and query have {uri} bytes, at most {MAX_URI_BYTES} are allowed");
         return Err(Problem::new(Code::UriTooLong, detail));
     }
     Ok(())
 }
 
-/// Two parties between client and service must not take different hosts for the one that is meant (RFC 9112, 3.2).
+/// Two parties between client and service must not take different hosts for the one that is meant
+/// (RFC 9112, 3.2).
 fn one_host(request: &Request) -> Result<(), Problem> {
     let hosts = request.headers().get_all(HOST).iter().count();
     // HTTP/2 has it in `:authority`, HTTP/1.0 knows none.
@@ -110,12 +123,10 @@ fn one_host(request: &Request) -> Result<(), Problem> {
     Ok(())
 }
 
-/// Bytes of the headers as they stand in a request of HTTP/1.1: name, colon, blank, value, line end.
+/// Bytes of the headers as they stand in a request of HTTP/1.1: name, colon, blank, value, line
+/// end.
 fn header_bytes(headers: &HeaderMap) -> usize {
-    headers
-        .iter()
-        .map(|(name, value)| name.as_str().len() + value.len() + 4)
-        .sum()
+    headers.iter().map(|(name, value)| name.as_str().len() + value.len() + 4).sum()
 }
 
 /// A path that no route has.
@@ -149,11 +160,8 @@ fn where_to_look(uri: &Uri) -> String {
 
 /// A path that does not take the method.
 pub(super) async fn wrong_method(request: Request) -> Response {
-    let path = request
-        .extensions()
-        .get::<MatchedPath>()
-        .map(MatchedPath::as_str)
-        .unwrap_or_default();
+    let path =
+        request.extensions().get::<MatchedPath>().map(MatchedPath::as_str).unwrap_or_default();
     let methods = routes::allow(path);
     let problem = Problem::new(
         Code::MethodNotAllowed,
@@ -186,10 +194,7 @@ mod tests {
     #[test]
     fn headers_are_measured_before_the_path() {
         assert_eq!(sized("/api/v1/nodes", 100), None);
-        assert_eq!(
-            sized(&format!("/{}", "a".repeat(MAX_URI_BYTES)), 1),
-            Some(Code::UriTooLong)
-        );
+        assert_eq!(sized(&format!("/{}", "a".repeat(MAX_URI_BYTES)), 1), Some(Code::UriTooLong));
         assert_eq!(sized(&format!("/{}", "a".repeat(MAX_URI_BYTES - 1)), 1), None);
         let too_many = MAX_HEADER_BYTES - 4;
         assert_eq!(sized("/", too_many), Some(Code::HeadersTooLarge));

@@ -1,5 +1,5 @@
-//! What the headers of a request say of documents: preconditions, keys of requests that come twice, where a watch goes on.
-//! Pure: every function takes headers and gives a value or a refusal.
+//! What the headers of a request say of documents: preconditions, keys of requests that come twice,
+//! where a watch goes on. Pure: every function takes headers and gives a value or a refusal.
 
 use axum::http::HeaderMap;
 use axum::http::header::{HeaderName, IF_MATCH, IF_NONE_MATCH};
@@ -74,9 +74,9 @@ pub(super) fn put_precondition(headers: &HeaderMap) -> Result<Precondition, Prob
     match (if_none_match(headers)?, given) {
         (None, given) => Ok(given),
         (Some(Tags::Any), Precondition::None) => Ok(Precondition::Absent),
-        (Some(Tags::Any), _) => Err(invalid(
-            "If-None-Match: * and If-Match contradict each other: send one of them",
-        )),
+        (Some(Tags::Any), _) => {
+            Err(invalid("If-None-Match: * and If-Match contradict each other: send one of them"))
+        }
         (Some(Tags::Revisions(_)), _) => Err(invalid("If-None-Match takes only * with PUT")),
     }
 }
@@ -126,17 +126,16 @@ fn parse_tags(text: &str) -> Result<Tags, &'static str> {
         if rest.is_empty() {
             return Ok(Tags::Revisions(revisions));
         }
-        rest = rest
-            .strip_prefix(',')
-            .ok_or("has something other than a comma after a tag")?;
+        rest = rest.strip_prefix(',').ok_or("has something other than a comma after a tag")?;
         rest = rest.trim_start_matches(blank);
     }
 }
 
 /// A revision as it stands in a tag: one spelling alone.
 fn revision(text: &str) -> Option<u64> {
-    let canonical =
-        !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit()) && (text == "0" || !text.starts_with('0'));
+    let canonical = !text.is_empty()
+        && text.bytes().all(|byte| byte.is_ascii_digit())
+        && (text == "0" || !text.starts_with('0'));
     if canonical { text.parse().ok() } else { None }
 }
 
@@ -150,7 +149,8 @@ pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Pro
     }
     let refuse = || {
         invalid(
-            "Idempotency-Key comes once and is 1 to 128 visible ASCII characters other than quotes, in quotes or not",
+            "Idempotency-Key comes once and is 1 to 128 visible ASCII characters other than \
+             quotes, in quotes or not",
         )
     };
     let text = single(headers, &IDEMPOTENCY_KEY)
@@ -179,11 +179,7 @@ pub(super) fn last_event_id(headers: &HeaderMap) -> Result<Option<u64>, Problem>
     if value.is_empty() {
         return Ok(None);
     }
-    let id = value
-        .to_str()
-        .ok()
-        .and_then(revision)
-        .filter(|id| *id <= MAX_INTEGER.unsigned_abs());
+    let id = value.to_str().ok().and_then(revision).filter(|id| *id <= MAX_INTEGER.unsigned_abs());
     match id {
         Some(id) => Ok(Some(id)),
         None => Err(invalid("Last-Event-ID is the id of an event of this watch: a revision")),
@@ -221,10 +217,7 @@ mod tests {
         };
         assert_eq!(read("*"), Ok(Tags::Any));
         assert_eq!(read("\"412\""), Ok(Tags::Revisions(vec![412])));
-        assert_eq!(
-            read("\"1\",\"2\" , W/\"3\", \"x,y\", \"04\""),
-            Ok(Tags::Revisions(vec![1, 2]))
-        );
+        assert_eq!(read("\"1\",\"2\" , W/\"3\", \"x,y\", \"04\""), Ok(Tags::Revisions(vec![1, 2])));
         assert_eq!(read("W/\"412\""), Ok(Tags::Revisions(Vec::new())));
         assert_eq!(read("\"\""), Ok(Tags::Revisions(Vec::new())));
         for bad in [
@@ -249,7 +242,9 @@ mod tests {
 
     #[test]
     fn put_may_insist_on_absence() {
-        let read = |pairs: &[(&str, &str)]| put_precondition(&headers(pairs)).map_err(|problem| problem.code);
+        let read = |pairs: &[(&str, &str)]| {
+            put_precondition(&headers(pairs)).map_err(|problem| problem.code)
+        };
         assert_eq!(read(&[]), Ok(Precondition::None));
         assert_eq!(read(&[("if-match", "*")]), Ok(Precondition::Any));
         assert_eq!(read(&[("if-none-match", "*")]), Ok(Precondition::Absent));
@@ -262,8 +257,9 @@ mod tests {
 
     #[test]
     fn idempotency_keys_are_visible_ascii() {
-        let read =
-            |value: &str| idempotency_key(&headers(&[("idempotency-key", value)])).map_err(|problem| problem.code);
+        let read = |value: &str| {
+            idempotency_key(&headers(&[("idempotency-key", value)])).map_err(|problem| problem.code)
+        };
         assert_eq!(read("a"), Ok(Some("a".to_owned())));
         assert_eq!(read("\"8e03978e-40d5\""), Ok(Some("8e03978e-40d5".to_owned())));
         assert_eq!(read(&"x".repeat(128)), Ok(Some("x".repeat(128))));
@@ -276,7 +272,9 @@ mod tests {
 
     #[test]
     fn a_watch_goes_on_after_an_event() {
-        let read = |value: &str| last_event_id(&headers(&[("last-event-id", value)])).map_err(|problem| problem.code);
+        let read = |value: &str| {
+            last_event_id(&headers(&[("last-event-id", value)])).map_err(|problem| problem.code)
+        };
         assert_eq!(read("412"), Ok(Some(412)));
         assert_eq!(read("0"), Ok(Some(0)));
         assert_eq!(read(""), Ok(None));
@@ -287,8 +285,10 @@ mod tests {
 
     proptest! {
         #[test]
-        fn tags_read_as_they_are_written(revisions in prop::collection::vec(0..=MAX_INTEGER.unsigned_abs(), 1..8)) {
-            let text = revisions.iter().map(|revision| etag(*revision)).collect::<Vec<_>>().join(", ");
+        fn tags_read_as_they_are_written(revisions in prop::collection::vec(0..=MAX_INTEGER
+            .unsigned_abs(), 1..8)) {
+            let text =
+                revisions.iter().map(|revision| etag(*revision)).collect::<Vec<_>>().join(", ");
             prop_assert_eq!(parse_tags(&text), Ok(Tags::Revisions(revisions)));
         }
 
@@ -299,7 +299,9 @@ mod tests {
                 for name in [IF_MATCH, IF_NONE_MATCH, IDEMPOTENCY_KEY, LAST_EVENT_ID] {
                     headers.insert(name, value.clone());
                 }
-                let _ = (if_match(&headers), put_precondition(&headers), idempotency_key(&headers), last_event_id(&headers));
+                let _ =
+                    (if_match(&headers), put_precondition(&headers), idempotency_key(&headers),
+                    last_event_id(&headers));
             }
         }
     }

@@ -20,14 +20,7 @@ pub(super) async fn list(call: &Call, kind: Kind) -> Result<Response, Problem> {
     let (limit, page_token) = (call.query.limit()?, call.query.page_token());
     let answer = call
         .service()
-        .history(
-            &call.caller,
-            &call.key(kind)?,
-            limit,
-            page_token,
-            full,
-            &call.read_options()?,
-        )
+        .history(&call.caller, &call.key(kind)?, limit, page_token, full, &call.read_options()?)
         .await?;
     let body = json::page(&answer.value, answer.revision, |entry| json::history_entry(entry, full));
     Ok(reply::json(StatusCode::OK, answer.revision, &body))

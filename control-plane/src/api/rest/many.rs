@@ -38,14 +38,10 @@ pub(super) async fn apply(call: &Call) -> Result<Response, Problem> {
         // Text that is made for it takes seconds to read.
         let bytes = bytes.clone();
         let reading = tokio::task::spawn_blocking(move || read(media, &bytes));
-        reading
-            .await
-            .map_err(|_| Problem::new(Code::Internal, "the body could not be read"))??
+        reading.await.map_err(|_| Problem::new(Code::Internal, "the body could not be read"))??
     };
-    let answer = call
-        .service()
-        .apply(&call.caller, ApplyRequest { items, ..request }, idempotency)
-        .await?;
+    let answer =
+        call.service().apply(&call.caller, ApplyRequest { items, ..request }, idempotency).await?;
     Ok(report(&answer))
 }
 
@@ -61,10 +57,7 @@ fn read(media: Media, bytes: &[u8]) -> Result<Vec<ApplyItem>, Problem> {
 pub(super) async fn revert(call: &Call) -> Result<Response, Problem> {
     let idempotency = call.idempotency()?;
     let RevertRequest { revision, force } = call.read()?;
-    let answer = call
-        .service()
-        .revert(&call.caller, revision, force, idempotency)
-        .await?;
+    let answer = call.service().revert(&call.caller, revision, force, idempotency).await?;
     Ok(report(&answer))
 }
 
@@ -89,10 +82,12 @@ fn array(bytes: &[u8]) -> Result<Vec<Value>, Problem> {
     match value {
         Value::Array(values) if values.len() > MAX_ITEMS => Err(too_many(values.len())),
         Value::Array(values) => Ok(values),
-        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Object(_) => Err(Problem::new(
-            Code::InvalidRequest,
-            "the body is no array of documents; YAML takes documents split by ---",
-        )),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Object(_) => {
+            Err(Problem::new(
+                Code::InvalidRequest,
+                "the body is no array of documents; YAML takes documents split by ---",
+            ))
+        }
     }
 }
 
@@ -127,10 +122,9 @@ fn items(values: Vec<Value>) -> Result<Vec<ApplyItem>, Problem> {
     for (index, value) in values.into_iter().enumerate() {
         match apply_item(value) {
             Ok(item) => items.push(item),
-            Err(found) => faults.extend(found.into_iter().map(|fault| FieldFault {
-                document: Some(index),
-                ..fault
-            })),
+            Err(found) => faults.extend(
+                found.into_iter().map(|fault| FieldFault { document: Some(index), ..fault }),
+            ),
         }
     }
     if faults.is_empty() {
@@ -150,7 +144,8 @@ mod tests {
             b"kind: Layer\nname: edge\nspec: { kind: edge }\n---\n{ kind: Layer, name: fog, spec: { kind: fog } }\n",
         )
         .unwrap();
-        let from_json = array(br#"[{"kind":"Layer","name":"edge","spec":{"kind":"edge"}},{"kind":"Layer","name":"fog","spec":{"kind":"fog"}}]"#);
+        let from_json =
+            array(br#"[{"kind":"Layer","name":"edge","spec":{"kind":"edge"}},{"kind":"Layer","name":"fog","spec":{"kind":"fog"}}]"#);
         assert_eq!(from_yaml, from_json.unwrap());
         assert_eq!(items(from_yaml).unwrap().len(), 2);
     }
@@ -169,11 +164,14 @@ mod tests {
     #[test]
     fn a_thousand_documents_are_enough() {
         let json = |count: usize| {
-            array(format!("[{}]", vec!["0"; count].join(",")).as_bytes()).map_err(|problem| problem.code)
+            array(format!("[{}]", vec!["0"; count].join(",")).as_bytes())
+                .map_err(|problem| problem.code)
         };
         assert_eq!(json(MAX_ITEMS).unwrap().len(), MAX_ITEMS);
         assert_eq!(json(MAX_ITEMS + 1), Err(Code::PayloadTooLarge));
-        let yaml = |count: usize| yaml("a: 1\n---\n".repeat(count).as_bytes()).map_err(|problem| problem.code);
+        let yaml = |count: usize| {
+            yaml("a: 1\n---\n".repeat(count).as_bytes()).map_err(|problem| problem.code)
+        };
         assert_eq!(yaml(MAX_ITEMS).unwrap().len(), MAX_ITEMS);
         assert_eq!(yaml(MAX_ITEMS + 1), Err(Code::PayloadTooLarge));
     }
@@ -183,8 +181,13 @@ mod tests {
         let values =
             array(br#"[{"kind":"Layer","name":"edge","spec":{}},{"kind":"Laier"},{"name":"x","spec":[]}]"#).unwrap();
         let problem = items(values).unwrap_err();
-        let documents: Vec<Option<usize>> = problem.errors.iter().map(|fault| fault.document).collect();
+        let documents: Vec<Option<usize>> =
+            problem.errors.iter().map(|fault| fault.document).collect();
         assert_eq!(problem.code, Code::ValidationFailed);
-        assert!(documents.contains(&Some(1)) && documents.contains(&Some(2)) && !documents.contains(&Some(0)));
+        assert!(
+            documents.contains(&Some(1))
+                && documents.contains(&Some(2))
+                && !documents.contains(&Some(0))
+        );
     }
 }

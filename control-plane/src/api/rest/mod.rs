@@ -8,8 +8,8 @@
 //!                          └▶ documents, history, apply, effective, system, tokens, watch ─▶ core
 //! ```
 //!
-//! The checks come in this order for every request; what a document may be is the core's matter. `routes` is the table
-//! of all operations, and the OpenAPI document is made from the same table.
+//! The checks come in this order for every request; what a document may be is the core's matter.
+//! `routes` is the table of all operations, and the OpenAPI document is made from the same table.
 
 mod body;
 mod documents;
@@ -49,8 +49,8 @@ pub use openapi::{openapi_3_0_json, openapi_json};
 
 /// Longest path with query, in bytes.
 const MAX_URI_BYTES: usize = 8 * 1024;
-/// Largest head of a request without its first line, in bytes. The listener must let through a little more, or it
-/// answers by itself and without a problem object.
+/// Largest head of a request without its first line, in bytes. The listener must let through a
+/// little more, or it answers by itself and without a problem object.
 const MAX_HEADER_BYTES: usize = 32 * 1024;
 /// From the head of a request to the head of its answer.
 const DEADLINE: Duration = Duration::from_secs(30);

@@ -38,22 +38,20 @@ pub(super) fn check(headers: &HeaderMap, action: Action) -> Result<(), Problem> 
     if ranges.is_empty() || offered.iter().any(|media| accepted(&ranges, media)) {
         return Ok(());
     }
-    let detail = format!(
-        "Accept takes none of the types that there are here: {}",
-        offered.join(", ")
-    );
+    let detail =
+        format!("Accept takes none of the types that there are here: {}", offered.join(", "));
     Err(Problem::new(Code::NotAcceptable, detail))
 }
 
 /// The most specific range that names a type decides.
 fn accepted(ranges: &[Range<'_>], media: &str) -> bool {
-    let matching = ranges
-        .iter()
-        .filter_map(|range| Some((range.specificity(media)?, range.wanted)));
+    let matching =
+        ranges.iter().filter_map(|range| Some((range.specificity(media)?, range.wanted)));
     matching.max().is_some_and(|(_, wanted)| wanted)
 }
 
-/// One media range; parameters other than `q` are not looked at, since no type here has any that matter.
+/// One media range; parameters other than `q` are not looked at, since no type here has any that
+/// matter.
 struct Range<'a> {
     media: &'a str,
     /// Its `q` is above 0.
@@ -65,7 +63,9 @@ impl<'a> Range<'a> {
         let mut parts = text.split(';').map(str::trim);
         let media = parts.next()?;
         let (kind, subtype) = media.split_once('/')?;
-        let token = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_graphic() && byte != b'/');
+        let token = |text: &str| {
+            !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_graphic() && byte != b'/')
+        };
         if !token(kind) || !token(subtype) || (kind == "*" && subtype != "*") {
             return None;
         }

@@ -1,4 +1,5 @@
-//! One operation: what is checked before the core is asked, in the order of the contract, and how it is answered.
+//! One operation: what is checked before the core is asked, in the order of the contract, and how
+//! it is answered.
 
 use std::sync::Arc;
 
@@ -18,7 +19,10 @@ use super::frame::{Visit, note};
 use super::gate::{Known, unknown};
 use super::query::Query;
 use super::routes::{Action, Route, Verb};
-use super::{Rest, documents, effective, headers, history, many, negotiate, reply, requests, system, tokens, watch};
+use super::{
+    Rest, documents, effective, headers, history, many, negotiate, reply, requests, system, tokens,
+    watch,
+};
 use crate::auth::Right;
 use crate::core::{Caller, ConfigService, Idempotency, ReadOptions};
 
@@ -38,7 +42,8 @@ pub(super) struct Names {
 }
 
 impl Names {
-    /// Takes the names out of a path that matches the route; `None` if one breaks its rules, so that nothing can be there.
+    /// Takes the names out of a path that matches the route; `None` if one breaks its rules, so
+    /// that nothing can be there.
     fn of(route: &Route, path: &str) -> Option<Self> {
         let mut names = Self::default();
         for (pattern, segment) in route.path.split('/').zip(path.split('/')) {
@@ -60,9 +65,7 @@ impl Names {
 
 fn token_id(segment: &str) -> Option<String> {
     let fits = segment.len() <= MAX_TOKEN_ID
-        && segment
-            .bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || b"._~-".contains(&byte))
+        && segment.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._~-".contains(&byte))
         && segment.starts_with(|first: char| first.is_ascii_alphanumeric());
     fits.then(|| segment.to_owned())
 }
@@ -146,7 +149,8 @@ impl Call {
 /// Answers a request whose path and method are those of a route.
 pub(super) async fn run(rest: &Arc<Rest>, route: &'static Route, request: Request) -> Response {
     let extensions = request.extensions();
-    let (Some(visit), Some(Known(claims))) = (extensions.get::<Visit>().cloned(), extensions.get::<Known>().cloned())
+    let (Some(visit), Some(Known(claims))) =
+        (extensions.get::<Visit>().cloned(), extensions.get::<Known>().cloned())
     else {
         // The gate sets both: without them nobody may come in.
         return reply::problem(
@@ -158,11 +162,8 @@ pub(super) async fn run(rest: &Arc<Rest>, route: &'static Route, request: Reques
     let Some(names) = Names::of(route, &visit.path) else {
         return unknown(request).await;
     };
-    let caller = Caller {
-        claims,
-        request_id: visit.request_id.to_string(),
-        address: visit.address,
-    };
+    let caller =
+        Caller { claims, request_id: visit.request_id.to_string(), address: visit.address };
     let answer = answer(rest, route, &visit, &names, &caller, request).await;
     let mut response = answer.unwrap_or_else(|problem| {
         if matches!(problem.code, Code::PermissionDenied | Code::Unauthenticated) {
@@ -179,7 +180,8 @@ pub(super) async fn run(rest: &Arc<Rest>, route: &'static Route, request: Reques
         }
         let mut response = reply::problem(&problem, &visit.path, &visit.request_id);
         if problem.code == Code::UnsupportedMediaType && route.verb == Verb::Patch {
-            let taken: Vec<&str> = route.payload.media().iter().map(|media| media.as_str()).collect();
+            let taken: Vec<&str> =
+                route.payload.media().iter().map(|media| media.as_str()).collect();
             reply::set(&mut response, ACCEPT_PATCH, &taken.join(", "));
         }
         response
@@ -223,11 +225,7 @@ async fn answer(
 
 fn too_late(writes: bool) -> Problem {
     let problem = Problem::new(Code::DeadlineExceeded, "there was no answer within 30 s");
-    if writes {
-        problem.applied(Applied::Unknown)
-    } else {
-        problem
-    }
+    if writes { problem.applied(Applied::Unknown) } else { problem }
 }
 
 async fn perform(call: &Call, action: Action) -> Result<Response, Problem> {
@@ -285,10 +283,7 @@ mod tests {
     fn ids_of_tokens_need_no_encoding() {
         let id = "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d11";
         assert_eq!(
-            names("revoke_token", &format!("/api/v1/tokens/{id}"))
-                .unwrap()
-                .id
-                .as_deref(),
+            names("revoke_token", &format!("/api/v1/tokens/{id}")).unwrap().id.as_deref(),
             Some(id)
         );
         for bad in ["..", "a%20b", "", &"a".repeat(129)] {

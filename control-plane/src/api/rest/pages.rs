@@ -1,4 +1,5 @@
-//! What is open to everybody: health, version, and the documentation, without anything from elsewhere.
+//! What is open to everybody: health, version, and the documentation, without anything from
+//! elsewhere.
 
 use std::borrow::Cow;
 use std::future::ready;
@@ -22,10 +23,14 @@ use super::query::Query;
 use super::{Rest, error_pages, gate, openapi, reply};
 
 /// Pages with a look of their own, and nothing else.
-const PAGE_POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; frame-ancestors 'none'";
-/// The page that shows the OpenAPI document: its scripts, its styles, its pictures, and requests to this service.
-const UI_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; \
-                         font-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+const PAGE_POLICY: &str =
+    "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; frame-ancestors 'none'";
+/// The page that shows the OpenAPI document: its scripts, its styles, its pictures, and requests to
+/// this service.
+const UI_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
+                         img-src 'self' data:; \
+                         font-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action \
+                         'none'; frame-ancestors 'none'";
 const HTML: &str = "text/html; charset=utf-8";
 const UI: &str = "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<title>BlazeConfig API</title>\n\
     <link rel=\"stylesheet\" href=\"/docs/ui/swagger-ui.css\">\n<link rel=\"icon\" type=\"image/png\" href=\"/docs/ui/favicon-32x32.png\">\n\
@@ -48,10 +53,7 @@ pub(super) fn router(rest: &Arc<Rest>) -> Router {
         )
         .route("/readyz", get(move || ready(readyz(&readiness))))
         .route("/version", get(|| ready(value(StatusCode::OK, "version", &version()))))
-        .route(
-            "/openapi.json",
-            get(move || ready(bytes("openapi", reply::JSON, newest.clone()))),
-        )
+        .route("/openapi.json", get(move || ready(bytes("openapi", reply::JSON, newest.clone()))))
         .route(
             "/openapi-3.0.json",
             get(move || ready(bytes("openapi", reply::JSON, older.clone()))),
@@ -144,10 +146,7 @@ async fn without_query(request: Request, next: Next) -> Response {
     let (Some(visit), false) = (visit, missed.contains(&response.status())) else {
         return response;
     };
-    let operation = response
-        .extensions()
-        .get::<Served>()
-        .and_then(|served| served.operation);
+    let operation = response.extensions().get::<Served>().and_then(|served| served.operation);
     let mut refused = reply::problem(&problem, &visit.path, &visit.request_id);
     note(&mut refused, |served| served.operation = operation);
     refused

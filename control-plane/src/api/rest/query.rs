@@ -37,11 +37,13 @@ macro_rules! params {
 params! {
     Limit = "limit", "Entries of one page, at most.";
     PageToken = "page_token", "`next_page_token` of the page before; empty: the first page.";
-    LabelSelector = "label_selector", "Kubernetes label selector: requirements joined by commas, all must hold.";
+    LabelSelector = "label_selector", "Kubernetes label selector: requirements joined by commas, \
+        all must hold.";
     Layer = "layer", "Only what is in this layer.";
     Node = "node", "Only what is on this node.";
     Revision = "revision", "As it was at this revision.";
-    MinRevision = "min_revision", "Waits up to 5 s until the answer reflects this revision, then 410 `revision_unknown`.";
+    MinRevision = "min_revision", "Waits up to 5 s until the answer reflects this revision, then \
+        410 `revision_unknown`.";
     Consistency = "consistency", "`cached` allows older data and works without the database.";
     Reveal = "reveal", "Secrets as text; needs the role admin, and is audited.";
     View = "view", "`full`: with the whole document in every entry.";
@@ -77,7 +79,8 @@ impl Query {
     /// Reads a query against what the route knows.
     ///
     /// # Errors
-    /// `unknown_parameter` for what is unknown or repeated, `invalid_request` for bad percent-encoding.
+    /// `unknown_parameter` for what is unknown or repeated, `invalid_request` for bad
+    /// percent-encoding.
     pub(super) fn parse(known: &[Param], text: Option<&str>) -> Result<Self, Problem> {
         let mut found: Vec<(Param, String)> = Vec::new();
         for pair in text.unwrap_or_default().split('&').filter(|pair| !pair.is_empty()) {
@@ -99,17 +102,17 @@ impl Query {
 
     /// The text of a parameter.
     pub(super) fn text(&self, param: Param) -> Option<&str> {
-        self.0
-            .iter()
-            .find(|(found, _)| *found == param)
-            .map(|(_, value)| value.as_str())
+        self.0.iter().find(|(found, _)| *found == param).map(|(_, value)| value.as_str())
     }
 
     /// A name.
     ///
     /// # Errors
     /// `invalid_request`.
-    pub(super) fn name<T: FromStr<Err = NameError>>(&self, param: Param) -> Result<Option<T>, Problem> {
+    pub(super) fn name<T: FromStr<Err = NameError>>(
+        &self,
+        param: Param,
+    ) -> Result<Option<T>, Problem> {
         let read = |text: &str| text.parse().map_err(|error: NameError| invalid(param, &error));
         self.text(param).map(read).transpose()
     }
@@ -130,7 +133,12 @@ impl Query {
     ///
     /// # Errors
     /// `invalid_request`.
-    pub(super) fn number(&self, param: Param, least: u64, most: u64) -> Result<Option<u64>, Problem> {
+    pub(super) fn number(
+        &self,
+        param: Param,
+        least: u64,
+        most: u64,
+    ) -> Result<Option<u64>, Problem> {
         let Some(text) = self.text(param) else { return Ok(None) };
         let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
         match text.parse() {
@@ -159,7 +167,11 @@ impl Query {
     ///
     /// # Errors
     /// `invalid_request`.
-    pub(super) fn word(&self, param: Param, words: &[&'static str]) -> Result<Option<&'static str>, Problem> {
+    pub(super) fn word(
+        &self,
+        param: Param,
+        words: &[&'static str],
+    ) -> Result<Option<&'static str>, Problem> {
         let Some(text) = self.text(param) else { return Ok(None) };
         match words.iter().find(|word| **word == text) {
             Some(word) => Ok(Some(word)),
@@ -172,9 +184,7 @@ impl Query {
     /// # Errors
     /// `invalid_request`.
     pub(super) fn limit(&self) -> Result<Option<u32>, Problem> {
-        Ok(self
-            .number(Param::Limit, 1, 1000)?
-            .and_then(|limit| u32::try_from(limit).ok()))
+        Ok(self.number(Param::Limit, 1, 1000)?.and_then(|limit| u32::try_from(limit).ok()))
     }
 
     /// `page_token`.
@@ -202,20 +212,13 @@ pub(super) const CONSISTENCY: &[&str] = &["strong", "cached"];
 fn unknown(known: &[Param], name: &str) -> String {
     let mut names: Vec<&str> = known.iter().map(|param| param.name()).collect();
     names.sort_unstable();
-    let list = if names.is_empty() {
-        "none".to_owned()
-    } else {
-        names.join(", ")
-    };
+    let list = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
     format!("there is no query parameter {} here; known are: {list}", quoted(name))
 }
 
 /// The value is not repeated: a problem holds nothing of the query but names.
 fn invalid(param: Param, reason: &dyn Display) -> Problem {
-    Problem::new(
-        Code::InvalidRequest,
-        format!("query parameter {} {reason}", param.name()),
-    )
+    Problem::new(Code::InvalidRequest, format!("query parameter {} {reason}", param.name()))
 }
 
 /// A name of the request in an answer: short, and without control characters.
@@ -249,13 +252,8 @@ mod tests {
 
     use super::*;
 
-    const LIST: &[Param] = &[
-        Param::Limit,
-        Param::PageToken,
-        Param::LabelSelector,
-        Param::Reveal,
-        Param::Consistency,
-    ];
+    const LIST: &[Param] =
+        &[Param::Limit, Param::PageToken, Param::LabelSelector, Param::Reveal, Param::Consistency];
 
     fn parse(text: &str) -> Result<Query, Code> {
         Query::parse(LIST, Some(text)).map_err(|problem| problem.code)
@@ -265,14 +263,7 @@ mod tests {
     fn unknown_and_repeated_parameters_are_refused() {
         assert_eq!(Query::parse(LIST, None), Ok(Query::default()));
         assert_eq!(parse(""), Ok(Query::default()));
-        for bad in [
-            "x=1",
-            "limit=1&limit=1",
-            "limit=1&lim%69t=1",
-            "Limit=1",
-            "=1",
-            "limit=1&%20",
-        ] {
+        for bad in ["x=1", "limit=1&limit=1", "limit=1&lim%69t=1", "Limit=1", "=1", "limit=1&%20"] {
             assert_eq!(parse(bad), Err(Code::UnknownParameter), "{bad}");
         }
         for bad in ["label_selector=%", "label_selector=%f", "label_selector=%ff", "%zz=1"] {
@@ -286,10 +277,7 @@ mod tests {
     #[test]
     fn values_have_one_spelling() {
         let limit = |text: &str| {
-            parse(&format!("limit={text}"))
-                .unwrap()
-                .limit()
-                .map_err(|problem| problem.code)
+            parse(&format!("limit={text}")).unwrap().limit().map_err(|problem| problem.code)
         };
         assert_eq!(limit("1000"), Ok(Some(1000)));
         for bad in ["0", "1001", "-1", "+1", "1.0", "", "x", "99999999999999999999999"] {

@@ -61,10 +61,7 @@ pub(super) fn document(status: StatusCode, revision: u64, document: &Document) -
 
 /// A document after a write: 201 with its place if it is new.
 pub(super) fn written(answer: &Answer<Written>) -> Response {
-    let Written {
-        document: shown,
-        created,
-    } = &answer.value;
+    let Written { document: shown, created } = &answer.value;
     let shown: &Arc<Document> = shown;
     let status = if *created { StatusCode::CREATED } else { StatusCode::OK };
     let mut response = document(status, answer.revision, shown);
@@ -95,19 +92,15 @@ pub(super) fn location(key: &Key) -> String {
 pub(super) fn problem(problem: &Problem, path: &str, request_id: &str) -> Response {
     let body = problem.to_json(path, request_id).to_string();
     let mut response = Response::new(Body::from(body));
-    let status = problem
-        .code
-        .http_status()
-        .and_then(|status| StatusCode::from_u16(status).ok());
+    let status = problem.code.http_status().and_then(|status| StatusCode::from_u16(status).ok());
     *response.status_mut() = status.unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
     set(&mut response, CONTENT_TYPE, PROBLEM);
     if let Some(seconds) = problem.retry_after_s {
         set(&mut response, RETRY_AFTER, &seconds.to_string());
     }
-    response.extensions_mut().insert(Refused {
-        code: problem.code,
-        internal: problem.internal.clone(),
-    });
+    response
+        .extensions_mut()
+        .insert(Refused { code: problem.code, internal: problem.internal.clone() });
     response
 }
 
@@ -117,9 +110,8 @@ mod tests {
 
     #[test]
     fn a_problem_becomes_a_response() {
-        let refusal = Problem::new(Code::RateLimited, "too many")
-            .retry_after(3)
-            .because("bucket of ops");
+        let refusal =
+            Problem::new(Code::RateLimited, "too many").retry_after(3).because("bucket of ops");
         let response = problem(&refusal, "/api/v1/nodes", "r-1");
         assert_eq!(response.status(), 429);
         assert_eq!(response.headers()[RETRY_AFTER], "3");

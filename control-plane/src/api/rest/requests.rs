@@ -1,4 +1,5 @@
-//! Small bodies of requests (`{"revision":412}`): read strictly; `openapi/parts.yaml` describes the same.
+//! Small bodies of requests (`{"revision":412}`): read strictly; `openapi/parts.yaml` describes the
+//! same.
 
 use blaze_domain::LayerName;
 use blaze_domain::config::{Code, FieldFault, Problem, json as pointers};
@@ -74,7 +75,9 @@ fn default_life_s() -> u64 {
     DEFAULT_TOKEN_LIFE_S.into()
 }
 
-fn whole<'de, D: Deserializer<'de>, const LEAST: u64, const MOST: u64>(from: D) -> Result<u64, D::Error> {
+fn whole<'de, D: Deserializer<'de>, const LEAST: u64, const MOST: u64>(
+    from: D,
+) -> Result<u64, D::Error> {
     let number = u64::deserialize(from)?;
     match (LEAST..=MOST).contains(&number) {
         true => Ok(number),
@@ -82,7 +85,9 @@ fn whole<'de, D: Deserializer<'de>, const LEAST: u64, const MOST: u64>(from: D) 
     }
 }
 
-fn text<'de, D: Deserializer<'de>, const LEAST: usize, const MOST: usize>(from: D) -> Result<String, D::Error> {
+fn text<'de, D: Deserializer<'de>, const LEAST: usize, const MOST: usize>(
+    from: D,
+) -> Result<String, D::Error> {
     let text = String::deserialize(from)?;
     match (LEAST..=MOST).contains(&text.chars().count()) {
         true => Ok(text),
@@ -101,9 +106,8 @@ pub(super) fn read<T: DeserializeOwned>(body: &Value) -> Result<T, Problem> {
     }
     serde_path_to_error::deserialize(body).map_err(|error| {
         let detail = error.inner().to_string();
-        let missing = detail
-            .strip_prefix("missing field `")
-            .and_then(|name| name.strip_suffix('`'));
+        let missing =
+            detail.strip_prefix("missing field `").and_then(|name| name.strip_suffix('`'));
         let path = error.path().iter().filter_map(|segment| match segment {
             Segment::Map { key } => Some(key.clone()),
             Segment::Seq { index } => Some(index.to_string()),

@@ -5,7 +5,8 @@
 //!        └─▶ openapi    paths, parameters, bodies and answers of the document
 //! ```
 //!
-//! Router and document come from the same rows, so that neither has an operation that the other lacks.
+//! Router and document come from the same rows, so that neither has an operation that the other
+//! lacks.
 
 use std::sync::Arc;
 
@@ -194,13 +195,8 @@ const LIST: &[Param] = &[
     Param::Consistency,
 ];
 const GET: &[Param] = &[Param::Revision, Param::Reveal, Param::MinRevision, Param::Consistency];
-const HISTORY: &[Param] = &[
-    Param::Limit,
-    Param::PageToken,
-    Param::View,
-    Param::MinRevision,
-    Param::Consistency,
-];
+const HISTORY: &[Param] =
+    &[Param::Limit, Param::PageToken, Param::View, Param::MinRevision, Param::Consistency];
 const DIFF: &[Param] = &[Param::From, Param::To, Param::MinRevision, Param::Consistency];
 const EFFECTIVE: &[Param] = &[
     Param::Service,
@@ -241,7 +237,8 @@ const AUDIT: &[Param] = &[
 
 /// One row; what is left out is as in most rows.
 macro_rules! row {
-    ($verb:ident $path:expr, $operation:expr, $action:expr, $right:ident, $query:expr, $payload:expr, $statuses:expr) => {
+    ($verb:ident $path:expr, $operation:expr, $action:expr, $right:ident, $query:expr,
+        $payload:expr, $statuses:expr) => {
         Route {
             verb: Verb::$verb,
             path: $path,
@@ -259,22 +256,37 @@ macro_rules! row {
 macro_rules! collection {
     ($kind:ident, $word:literal, $plural:literal, $path:literal) => {
         [
-            row!(Get $path, concat!("list_", $plural), Action::List(Kind::$kind), Read, LIST, Payload::None, &[200, 410]),
+            row!(
+                Get $path,
+                concat!("list_", $plural),
+                Action::List(Kind::$kind),
+                Read,
+                LIST,
+                Payload::None,
+                &[200, 410],
+            ),
             row!(Post $path, concat!("create_", $word), Action::Create(Kind::$kind), Write, &[],
                 Payload::Document(Kind::$kind), &[201, 409, 413, 415, 422]),
-            row!(Get concat!($path, "/{name}"), concat!("get_", $word), Action::Get(Kind::$kind), Read, GET,
+            row!(Get concat!($path, "/{name}"), concat!("get_", $word), Action::Get(Kind::$kind),
+                Read, GET,
                 Payload::None, &[200, 304, 410]),
-            row!(Put concat!($path, "/{name}"), concat!("replace_", $word), Action::Replace(Kind::$kind), Write, &[],
+            row!(Put concat!($path, "/{name}"), concat!("replace_", $word),
+                Action::Replace(Kind::$kind), Write, &[],
                 Payload::Document(Kind::$kind), &[200, 201, 409, 412, 413, 415, 422, 428]),
-            row!(Patch concat!($path, "/{name}"), concat!("patch_", $word), Action::Patch(Kind::$kind), Write, &[],
+            row!(Patch concat!($path, "/{name}"), concat!("patch_", $word),
+                Action::Patch(Kind::$kind), Write, &[],
                 Payload::MergePatch, &[200, 409, 412, 413, 415, 422, 428]),
-            row!(Delete concat!($path, "/{name}"), concat!("delete_", $word), Action::Delete(Kind::$kind), Write,
+            row!(Delete concat!($path, "/{name}"), concat!("delete_", $word),
+                Action::Delete(Kind::$kind), Write,
                 &[Param::Cascade], Payload::None, &[204, 409, 412, 422, 428]),
-            row!(Get concat!($path, "/{name}/history"), concat!("list_", $word, "_history"), Action::History(Kind::$kind),
+            row!(Get concat!($path, "/{name}/history"), concat!("list_", $word, "_history"),
+                Action::History(Kind::$kind),
                 Read, HISTORY, Payload::None, &[200, 410]),
-            row!(Get concat!($path, "/{name}/diff"), concat!("diff_", $word), Action::Diff(Kind::$kind), Read, DIFF,
+            row!(Get concat!($path, "/{name}/diff"), concat!("diff_", $word),
+                Action::Diff(Kind::$kind), Read, DIFF,
                 Payload::None, &[200, 410]),
-            row!(Post concat!($path, "/{name}/rollback"), concat!("rollback_", $word), Action::Rollback(Kind::$kind),
+            row!(Post concat!($path, "/{name}/rollback"), concat!("rollback_", $word),
+                Action::Rollback(Kind::$kind),
                 Write, &[], Payload::Rollback, &[200, 409, 410, 412, 413, 415, 422]),
         ]
     };
@@ -283,33 +295,103 @@ macro_rules! collection {
 static LAYERS: [Route; 9] = collection!(Layer, "layer", "layers", "/api/v1/layers");
 static NODES: [Route; 9] = collection!(Node, "node", "nodes", "/api/v1/nodes");
 static SERVICES: [Route; 9] = collection!(Service, "service", "services", "/api/v1/services");
-static INSTANCES: [Route; 9] = collection!(
-    Instance,
-    "instance",
-    "instances",
-    "/api/v1/services/{service}/instances"
-);
+static INSTANCES: [Route; 9] =
+    collection!(Instance, "instance", "instances", "/api/v1/services/{service}/instances");
 static ROLLOUTS: [Route; 9] = collection!(Rollout, "rollout", "rollouts", "/api/v1/rollouts");
 
 static OTHERS: [Route; 14] = [
-    row!(Post "/api/v1/rollouts/{name}/promote", "promote_rollout", Action::Promote, Write, &[], Payload::None, &[200, 409, 422]),
-    row!(Post "/api/v1/rollouts/{name}/abort", "abort_rollout", Action::Abort, Write, &[], Payload::Abort,
+    row!(
+        Post "/api/v1/rollouts/{name}/promote",
+        "promote_rollout",
+        Action::Promote,
+        Write,
+        &[],
+        Payload::None,
+        &[200, 409, 422],
+    ),
+    row!(Post "/api/v1/rollouts/{name}/abort", "abort_rollout", Action::Abort, Write, &[],
+        Payload::Abort,
         &[200, 409, 413, 415, 422]),
-    row!(Post "/api/v1/apply", "apply", Action::Apply, Write, &[Param::DryRun, Param::Prune, Param::PruneConfirm],
+    row!(Post "/api/v1/apply", "apply", Action::Apply, Write,
+        &[Param::DryRun, Param::Prune, Param::PruneConfirm],
         Payload::Documents, &[200, 404, 409, 413, 415, 422]),
     row!(Post "/api/v1/revert", "revert", Action::Revert, Write, &[], Payload::Revert,
         &[200, 404, 409, 410, 413, 415, 422]),
-    row!(Get "/api/v1/effective", "get_effective", Action::Effective, Read, EFFECTIVE, Payload::None, &[200, 404, 410]),
+    row!(
+        Get "/api/v1/effective",
+        "get_effective",
+        Action::Effective,
+        Read,
+        EFFECTIVE,
+        Payload::None,
+        &[200, 404, 410],
+    ),
     row!(Get "/api/v1/watch", "watch", Action::Watch, Read, WATCH, Payload::None, &[200, 410]),
-    row!(Get "/api/v1/topology", "get_topology", Action::Topology, Read, READ, Payload::None, &[200, 410]),
-    row!(Get "/api/v1/workers", "list_workers", Action::Workers, Read, READ, Payload::None, &[200, 410]),
-    row!(Get "/api/v1/digest", "get_digest", Action::Digest, Read, DIGEST, Payload::None, &[200, 404, 410]),
-    row!(Get "/api/v1/audit", "list_audit", Action::Audit, Admin, AUDIT, Payload::None, &[200, 410]),
-    row!(Get "/api/v1/tokens", "list_tokens", Action::Tokens, Admin, READ, Payload::None, &[200, 410]),
+    row!(
+        Get "/api/v1/topology",
+        "get_topology",
+        Action::Topology,
+        Read,
+        READ,
+        Payload::None,
+        &[200, 410],
+    ),
+    row!(
+        Get "/api/v1/workers",
+        "list_workers",
+        Action::Workers,
+        Read,
+        READ,
+        Payload::None,
+        &[200, 410],
+    ),
+    row!(
+        Get "/api/v1/digest",
+        "get_digest",
+        Action::Digest,
+        Read,
+        DIGEST,
+        Payload::None,
+        &[200, 404, 410],
+    ),
+    row!(
+        Get "/api/v1/audit",
+        "list_audit",
+        Action::Audit,
+        Admin,
+        AUDIT,
+        Payload::None,
+        &[200, 410],
+    ),
+    row!(
+        Get "/api/v1/tokens",
+        "list_tokens",
+        Action::Tokens,
+        Admin,
+        READ,
+        Payload::None,
+        &[200, 410],
+    ),
     row!(Post "/api/v1/tokens", "create_token", Action::CreateToken, Admin, &[], Payload::Token,
         &[201, 409, 413, 415, 422]),
-    row!(Delete "/api/v1/tokens/{id}", "revoke_token", Action::RevokeToken, Admin, &[], Payload::None, &[204]),
-    row!(Post "/api/v1/trim", "trim", Action::Trim, Admin, &[], Payload::Trim, &[200, 409, 413, 415, 422]),
+    row!(
+        Delete "/api/v1/tokens/{id}",
+        "revoke_token",
+        Action::RevokeToken,
+        Admin,
+        &[],
+        Payload::None,
+        &[204],
+    ),
+    row!(
+        Post "/api/v1/trim",
+        "trim",
+        Action::Trim,
+        Admin,
+        &[],
+        Payload::Trim,
+        &[200, 409, 413, 415, 422],
+    ),
 ];
 
 /// All rows.
@@ -364,9 +446,8 @@ mod tests {
     #[test]
     fn rights_follow_the_method() {
         for route in all() {
-            let needs_admin = ["audit", "token", "trim"]
-                .iter()
-                .any(|word| route.operation.contains(word));
+            let needs_admin =
+                ["audit", "token", "trim"].iter().any(|word| route.operation.contains(word));
             let expected = match (needs_admin, route.verb.writes()) {
                 (true, _) => Right::Admin,
                 (false, true) => Right::Write,

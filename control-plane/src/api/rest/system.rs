@@ -27,16 +27,12 @@ fn value(answer: &Answer<Value>) -> Response {
 
 /// `GET /topology`
 pub(super) async fn topology(call: &Call) -> Result<Response, Problem> {
-    Ok(value(
-        &call.service().topology(&call.caller, &call.read_options()?).await?,
-    ))
+    Ok(value(&call.service().topology(&call.caller, &call.read_options()?).await?))
 }
 
 /// `GET /workers`
 pub(super) async fn workers(call: &Call) -> Result<Response, Problem> {
-    Ok(value(
-        &call.service().workers(&call.caller, &call.read_options()?).await?,
-    ))
+    Ok(value(&call.service().workers(&call.caller, &call.read_options()?).await?))
 }
 
 /// `GET /digest`
@@ -47,12 +43,7 @@ pub(super) async fn digest(call: &Call) -> Result<Response, Problem> {
             "query parameter layer is missing: the layer to digest",
         ));
     };
-    Ok(value(
-        &call
-            .service()
-            .digest(&call.caller, &layer, &call.read_options()?)
-            .await?,
-    ))
+    Ok(value(&call.service().digest(&call.caller, &layer, &call.read_options()?).await?))
 }
 
 /// `GET /audit`
@@ -62,13 +53,9 @@ pub(super) async fn audit(call: &Call) -> Result<Response, Problem> {
     let wanted = AuditQuery {
         subject: subject(query.text(Param::Subject))?,
         kind: query.word(Param::Kind, &kinds)?.map(str::to_owned),
-        name: query
-            .name::<DocumentName>(Param::AuditName)?
-            .map(|name| name.to_string()),
+        name: query.name::<DocumentName>(Param::AuditName)?.map(|name| name.to_string()),
         action: action(query.text(Param::Action))?,
-        allowed: query
-            .word(Param::Outcome, OUTCOMES)?
-            .map(|outcome| outcome == "allowed"),
+        allowed: query.word(Param::Outcome, OUTCOMES)?.map(|outcome| outcome == "allowed"),
         since: query.time(Param::SinceTime)?,
         until: query.time(Param::UntilTime)?,
         below: None,
@@ -85,7 +72,9 @@ pub(super) async fn audit(call: &Call) -> Result<Response, Problem> {
 fn subject(text: Option<&str>) -> Result<Option<String>, Problem> {
     match text {
         Some(text) if text.is_empty() || text.chars().count() > MAX_SUBJECT => {
-            let detail = format!("query parameter subject is empty, or has more than {MAX_SUBJECT} characters");
+            let detail = format!(
+                "query parameter subject is empty, or has more than {MAX_SUBJECT} characters"
+            );
             Err(Problem::new(Code::InvalidRequest, detail))
         }
         text => Ok(text.map(str::to_owned)),
@@ -95,7 +84,8 @@ fn subject(text: Option<&str>) -> Result<Option<String>, Problem> {
 /// Words of actions are an open set: what this process does not know, another one may have written.
 fn action(text: Option<&str>) -> Result<Option<String>, Problem> {
     let fits = |text: &str| {
-        (1..=MAX_ACTION).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_lowercase() || byte == b'_')
+        (1..=MAX_ACTION).contains(&text.len())
+            && text.bytes().all(|byte| byte.is_ascii_lowercase() || byte == b'_')
     };
     match text {
         Some(text) if !fits(text) => {
@@ -112,10 +102,7 @@ pub(super) async fn trim(call: &Call) -> Result<Response, Problem> {
     let TrimRequest { before } = call.read()?;
     let answer = call.service().trim(&call.caller, before, idempotency).await?;
     let body = json!({ "oldest_revision": answer.value });
-    Ok(reply::replayed(
-        reply::json(StatusCode::OK, answer.revision, &body),
-        answer.replayed,
-    ))
+    Ok(reply::replayed(reply::json(StatusCode::OK, answer.revision, &body), answer.replayed))
 }
 
 #[cfg(test)]

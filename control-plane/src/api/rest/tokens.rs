@@ -13,10 +13,7 @@ use crate::core::{Page, TokenRequest};
 /// `GET /tokens`
 pub(super) async fn list(call: &Call) -> Result<Response, Problem> {
     let answer = call.service().tokens(&call.caller, &call.read_options()?).await?;
-    let page = Page {
-        items: answer.value,
-        next_page_token: String::new(),
-    };
+    let page = Page { items: answer.value, next_page_token: String::new() };
     let body = json::page(&page, answer.revision, json::token);
     Ok(reply::json(StatusCode::OK, answer.revision, &body))
 }
@@ -73,12 +70,10 @@ mod tests {
 
     #[test]
     fn a_request_is_read_strictly() {
-        let body = json!({ "subject": "ops", "roles": ["operator"], "layer": null, "expires_in_s": 60 });
+        let body =
+            json!({ "subject": "ops", "roles": ["operator"], "layer": null, "expires_in_s": 60 });
         let read = request(&body).unwrap();
-        assert_eq!(
-            (read.subject.as_str(), read.layer, read.expires_in_s),
-            ("ops", None, 60)
-        );
+        assert_eq!((read.subject.as_str(), read.layer, read.expires_in_s), ("ops", None, 60));
         let short = request(&json!({ "subject": "ops", "roles": ["viewer"] })).unwrap();
         assert_eq!(short.expires_in_s, DEFAULT_TOKEN_LIFE_S);
         for (body, pointer) in [
@@ -89,14 +84,8 @@ mod tests {
             (json!({ "subject": "ops", "roles": [1] }), "/roles/0"),
             (json!({ "subject": "ops", "roles": ["root"] }), "/roles/0"),
             (json!({ "subject": "ops", "roles": ["admin", "admin"] }), "/roles/1"),
-            (
-                json!({ "subject": "ops", "roles": ["viewer"], "layer": "Edge" }),
-                "/layer",
-            ),
-            (
-                json!({ "subject": "ops", "roles": ["viewer"], "expires_in_s": 0 }),
-                "/expires_in_s",
-            ),
+            (json!({ "subject": "ops", "roles": ["viewer"], "layer": "Edge" }), "/layer"),
+            (json!({ "subject": "ops", "roles": ["viewer"], "expires_in_s": 0 }), "/expires_in_s"),
             (
                 json!({ "subject": "ops", "roles": ["viewer"], "expires_in_s": 31_536_001 }),
                 "/expires_in_s",

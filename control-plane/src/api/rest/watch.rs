@@ -32,12 +32,13 @@ use crate::metrics::OpenGauge;
 
 /// Tells reverse proxies to hand on every event at once.
 const X_ACCEL_BUFFERING: HeaderName = HeaderName::from_static("x-accel-buffering");
-/// Milliseconds until a client that was cut off comes back, drawn once per stream: clients that are cut off together do
-/// not come back together.
+/// Milliseconds until a client that was cut off comes back, drawn once per stream: clients that are
+/// cut off together do not come back together.
 const RETRY_MS: std::ops::RangeInclusive<u32> = 1000..=5000;
 /// Longest a watch may be asked for, in seconds.
 pub(super) const MAX_TIMEOUT_S: u64 = 3600;
-/// An event of so many bytes is sent in one piece; a longer one shares its JSON with the other watchers.
+/// An event of so many bytes is sent in one piece; a longer one shares its JSON with the other
+/// watchers.
 const COPIED_BYTES: usize = 4096;
 
 /// `GET /watch`
@@ -58,11 +59,7 @@ pub(super) async fn open(call: &Call) -> Result<Response, Problem> {
     *response.status_mut() = StatusCode::OK;
     reply::set(&mut response, CONTENT_TYPE, EVENT_STREAM);
     reply::set(&mut response, X_ACCEL_BUFFERING, "no");
-    reply::set(
-        &mut response,
-        super::headers::BLAZE_REVISION,
-        &answer.revision.to_string(),
-    );
+    reply::set(&mut response, super::headers::BLAZE_REVISION, &answer.revision.to_string());
     Ok(response)
 }
 
@@ -75,9 +72,7 @@ fn query(call: &Call) -> Result<WatchQuery, Problem> {
     Ok(WatchQuery {
         since: last_event_id(&call.headers)?.or(since),
         kind: kind.and_then(|kind| kind.parse().ok()),
-        name: query
-            .name::<blaze_domain::DocumentName>(Param::Name)?
-            .map(|name| name.to_string()),
+        name: query.name::<blaze_domain::DocumentName>(Param::Name)?.map(|name| name.to_string()),
         service: query.name(Param::Service)?,
         layer: query.name(Param::Layer)?,
         label_selector: query.text(Param::LabelSelector).map(str::to_owned),
@@ -150,8 +145,7 @@ impl<S: Stream<Item = WatchItem> + Send + Unpin + 'static> Events<S> {
             whole.extend_from_slice(b"\n\n");
             self.ready.push_back(Bytes::from(whole));
         } else {
-            self.ready
-                .extend([Bytes::from(head), data, Bytes::from_static(b"\n\n")]);
+            self.ready.extend([Bytes::from(head), data, Bytes::from_static(b"\n\n")]);
         }
     }
 }

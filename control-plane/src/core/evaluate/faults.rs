@@ -30,8 +30,8 @@ pub(super) fn not_found(key: &Key) -> Problem {
     Problem::new(Code::NotFound, format!("there is no {key}"))
 }
 
-/// Names referrers as far as the token sees them, before the change (where what they stand on is there) or after it. How
-/// many there are besides is nothing to who does not see them.
+/// Names referrers as far as the token sees them, before the change (where what they stand on is
+/// there) or after it. How many there are besides is nothing to who does not see them.
 pub(super) fn in_use(key: &Key, referrers: &[Key], states: [&State; 2], view: &View) -> Problem {
     let is_seen = |key: &&Key| {
         states.iter().any(|state| {
@@ -67,11 +67,7 @@ pub(super) struct Faults {
 
 impl Faults {
     pub(super) fn new(form: Form) -> Self {
-        Self {
-            form,
-            invalid: Vec::new(),
-            conflicts: Vec::new(),
-        }
+        Self { form, invalid: Vec::new(), conflicts: Vec::new() }
     }
 
     /// How many more are told.

@@ -27,7 +27,8 @@ pub(super) struct Target {
     pub(super) annotations: Labels,
     pub(super) spec: Value,
     pub(super) status: Option<Value>,
-    /// Uid under which encrypted secrets in `spec` were encrypted, if it is not the document's present one.
+    /// Uid under which encrypted secrets in `spec` were encrypted, if it is not the document's
+    /// present one.
     pub(super) from_uid: Option<String>,
 }
 
@@ -55,7 +56,8 @@ pub(super) fn outcome_of(
         }
         Content::Patch(patch) => {
             let current = current.ok_or_else(|| Box::new(not_found(&item.key)))?;
-            let input = patch_input(state, &item.key, patch).map_err(|faults| Box::new(Problem::faults(faults)))?;
+            let input = patch_input(state, &item.key, patch)
+                .map_err(|faults| Box::new(Problem::faults(faults)))?;
             one(Outcome::Put(Box::new(written(&input, Some(current))?)), Op::Update)
         }
         Content::Leave => one(Outcome::Keep, Op::Update),
@@ -64,14 +66,9 @@ pub(super) fn outcome_of(
             None if request.form == Form::Many => one(Outcome::Keep, Op::Delete),
             None => Err(Box::new(not_found(&item.key))),
         },
-        Content::Restore(None) => one(
-            if current.is_some() {
-                Outcome::Remove
-            } else {
-                Outcome::Keep
-            },
-            Op::Delete,
-        ),
+        Content::Restore(None) => {
+            one(if current.is_some() { Outcome::Remove } else { Outcome::Keep }, Op::Delete)
+        }
         Content::Restore(Some(version)) => {
             if version.key.kind() == Kind::Rollout {
                 let detail = "a roll-out is not set back; start another one";
@@ -102,7 +99,12 @@ pub(super) fn outcome_of(
     }
 }
 
-fn precondition(state: &State, request: &Request, item: &Item, current: Option<&Document>) -> Result<(), Box<Problem>> {
+fn precondition(
+    state: &State,
+    request: &Request,
+    item: &Item,
+    current: Option<&Document>,
+) -> Result<(), Box<Problem>> {
     // Of what is missing, that of the store is told.
     let revision = current.map_or(state.revision(), |document| document.revision);
     let fail = |problem: Problem| Err(Box::new(problem.at(revision)));
@@ -129,21 +131,16 @@ fn precondition(state: &State, request: &Request, item: &Item, current: Option<&
             );
             fail(Problem::new(Code::PreconditionRequired, detail))
         }
-        (Precondition::Revisions(wanted), Some(document)) if !wanted.contains(&document.revision) => {
-            let code = if many {
-                Code::RevisionConflict
-            } else {
-                Code::PreconditionFailed
-            };
-            let detail = format!("{} has revision {} now: read it again", item.key, document.revision);
+        (Precondition::Revisions(wanted), Some(document))
+            if !wanted.contains(&document.revision) =>
+        {
+            let code = if many { Code::RevisionConflict } else { Code::PreconditionFailed };
+            let detail =
+                format!("{} has revision {} now: read it again", item.key, document.revision);
             fail(Problem::new(code, detail))
         }
         (Precondition::Revisions(_) | Precondition::Any, None) => {
-            let code = if many {
-                Code::RevisionConflict
-            } else {
-                Code::PreconditionFailed
-            };
+            let code = if many { Code::RevisionConflict } else { Code::PreconditionFailed };
             fail(Problem::new(code, format!("{} does not exist", item.key)))
         }
         (Precondition::Absent, Some(_)) if request.form != Form::Create => {
@@ -158,10 +155,8 @@ fn written(input: &DocumentInput, current: Option<&Document>) -> Result<Target, 
     let faults = spec::check(&input.key, &input.labels, &input.annotations, &input.spec);
     let bytes = spec::document_size(&input.labels, &input.annotations, &input.spec);
     if bytes > MAX_DOCUMENT_BYTES {
-        let detail = format!(
-            "{} has {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed",
-            input.key
-        );
+        let detail =
+            format!("{} has {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed", input.key);
         return Err(Box::new(Problem::new(Code::PayloadTooLarge, detail)));
     }
     if !faults.is_empty() {
@@ -198,13 +193,11 @@ fn patch_input(state: &State, key: &Key, patch: &Value) -> Result<DocumentInput,
         return Err(vec![invalid("", "it does not exist")]);
     };
     let Value::Object(members) = patch else {
-        return Err(vec![invalid(
-            "",
-            "a patch is an object with labels, annotations or spec",
-        )]);
+        return Err(vec![invalid("", "a patch is an object with labels, annotations or spec")]);
     };
     let mut whole = json!({
-        "labels": held.document.labels, "annotations": held.document.annotations, "spec": *held.shown.spec,
+        "labels": held.document.labels, "annotations": held.document.annotations,
+        "spec": *held.shown.spec,
     });
     let known = ["labels", "annotations", "spec", "kind", "name", "service"];
     let server_set = ["uid", "revision", "create_time", "update_time", "updated_by", "status"];
@@ -218,9 +211,7 @@ fn patch_input(state: &State, key: &Key, patch: &Value) -> Result<DocumentInput,
         }
         own.insert(name.clone(), value.clone());
     }
-    let needed = ["kind", "name"]
-        .into_iter()
-        .chain(key.service_name().map(|_| "service"));
+    let needed = ["kind", "name"].into_iter().chain(key.service_name().map(|_| "service"));
     for name in needed {
         if own.get(name).is_some_and(Value::is_null) {
             return Err(vec![invalid(&format!("/{name}"), "cannot be taken away")]);
@@ -248,9 +239,7 @@ fn canary_phase(state: &State, key: &Key) -> Result<Arc<Document>, Box<Problem>>
         "{key} is {}; only one in phase canary can be promoted or aborted",
         phase(&held.document)
     );
-    Err(Box::new(
-        Problem::new(Code::RolloutState, detail).at(held.document.revision),
-    ))
+    Err(Box::new(Problem::new(Code::RolloutState, detail).at(held.document.revision)))
 }
 
 fn with_phase(rollout: &Document, phase: &str, reason: &str) -> Outcome {
@@ -304,15 +293,14 @@ fn abort(state: &State, key: &Key, reason: &str) -> Result<Vec<(Key, Outcome, Op
     Ok(vec![(key.clone(), with_phase(&rollout, "aborted", reason), Op::Update)])
 }
 
-/// What becomes of a roll-out that failed on a canary; one that has ended, or is another one, stays as it is.
+/// What becomes of a roll-out that failed on a canary; one that has ended, or is another one, stays
+/// as it is.
 fn fail(current: Option<&Document>, failed: &Failed) -> Outcome {
     let is_it = |rollout: &&Document| rollout.uid == failed.uid && is_active(rollout);
     let Some(rollout) = current.filter(is_it) else {
         return Outcome::Keep;
     };
-    let Failed {
-        node, reason, revision, ..
-    } = failed;
+    let Failed { node, reason, revision, .. } = failed;
     let mut outcome = with_phase(rollout, "failed", &format!("{node}: {reason}"));
     if let Outcome::Put(target) = &mut outcome
         && let Some(status) = &mut target.status
@@ -356,7 +344,11 @@ pub(super) fn prune_into(
 }
 
 /// Adds what refers to what is deleted, until nothing is left over.
-pub(super) fn cascade_into(state: &State, outcomes: &mut BTreeMap<Key, (Outcome, Op)>, order: &mut Vec<Key>) {
+pub(super) fn cascade_into(
+    state: &State,
+    outcomes: &mut BTreeMap<Key, (Outcome, Op)>,
+    order: &mut Vec<Key>,
+) {
     let mut open: Vec<Key> = outcomes
         .iter()
         .filter(|(_, (outcome, _))| matches!(outcome, Outcome::Remove))
@@ -394,15 +386,18 @@ pub(super) fn same_spec(one: &Value, other: &Value) -> bool {
 /// `1` and `1.0` are the same number, as they are in the canonical text.
 fn same_value(one: &Value, other: &Value) -> bool {
     match (one, other) {
-        (Value::Number(one), Value::Number(other)) => one == other || one.as_f64() == other.as_f64(),
+        (Value::Number(one), Value::Number(other)) => {
+            one == other || one.as_f64() == other.as_f64()
+        }
         (Value::Array(one), Value::Array(other)) => {
-            one.len() == other.len() && one.iter().zip(other).all(|(one, other)| same_value(one, other))
+            one.len() == other.len()
+                && one.iter().zip(other).all(|(one, other)| same_value(one, other))
         }
         (Value::Object(one), Value::Object(other)) => {
             one.len() == other.len()
-                && one
-                    .iter()
-                    .all(|(name, value)| other.get(name).is_some_and(|found| same_value(value, found)))
+                && one.iter().all(|(name, value)| {
+                    other.get(name).is_some_and(|found| same_value(value, found))
+                })
         }
         (one, other) => one == other,
     }

@@ -40,8 +40,8 @@ impl ConfigService {
         Arc::new(shown)
     }
 
-    /// Has roll-outs ended that a worker has undone. Nobody waits for it: as long as the worker sees them go on, it says so
-    /// again.
+    /// Has roll-outs ended that a worker has undone. Nobody waits for it: as long as the worker
+    /// sees them go on, it says so again.
     pub(super) fn end_failed(&self, session: &WorkerSession, has: &Acknowledged) {
         let failed = |report: &&RolloutReport| report.phase == "failed";
         let mut failed = has.rollouts.iter().filter(failed).peekable();
@@ -69,12 +69,18 @@ impl ConfigService {
 
     fn end_one(&self, session: &WorkerSession, key: Key, failed: Failed) {
         // Until the first word of it is dealt with, the others add nothing.
-        let Some(running) = Running::begin(&self.inner.running, &format!("failed/{}", failed.uid)) else {
+        let Some(running) = Running::begin(&self.inner.running, &format!("failed/{}", failed.uid))
+        else {
             return;
         };
         let room = Arc::clone(&self.inner.room).try_acquire_many_owned(BYTES);
         let Ok(room) = room else { return };
-        tracing::warn!(rollout = %key, node = %failed.node, reason = failed.reason, "a roll-out has failed");
+        tracing::warn!(
+            rollout = %key,
+            node = %failed.node,
+            reason = failed.reason,
+            "a roll-out has failed",
+        );
         let queued = Queued {
             request: Arc::new(Request {
                 caller: worker(session),
@@ -112,8 +118,8 @@ fn is_tried(state: &State, rollout: &Document, node: &NodeName, layer: &LayerNam
         && placement(state, rollout).visible.contains(layer)
 }
 
-/// The worker as one that asks. It is bound to no layer, because a roll-out ends in all of them; what it may end has been
-/// looked at before.
+/// The worker as one that asks. It is bound to no layer, because a roll-out ends in all of them;
+/// what it may end has been looked at before.
 fn worker(session: &WorkerSession) -> Caller {
     let name = session.name();
     let node = name.node.as_ref().map_or("-", NodeName::as_str);

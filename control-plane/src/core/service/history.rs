@@ -47,16 +47,17 @@ impl ConfigService {
     }
 
     /// The version of a document that held at a revision.
-    pub(super) async fn version_at(&self, state: &State, key: &Key, revision: u64) -> Result<Version, Problem> {
+    pub(super) async fn version_at(
+        &self,
+        state: &State,
+        key: &Key,
+        revision: u64,
+    ) -> Result<Version, Problem> {
         if revision > state.revision() {
             let detail = format!("the store is at revision {}", state.revision());
             return Err(Problem::new(Code::RevisionUnknown, detail).at(state.revision()));
         }
-        let found = self
-            .inner
-            .store
-            .versions(key, Some(revision.saturating_add(1)), 1)
-            .await;
+        let found = self.inner.store.versions(key, Some(revision.saturating_add(1)), 1).await;
         let found = found.map_err(|error| unavailable(&error))?.into_iter().next();
         match found {
             Some(version) if version.change.op != Op::Delete => Ok(version),
@@ -105,10 +106,10 @@ impl ConfigService {
         if versions.is_empty() && page_token.is_empty() && state.get(key).is_none() {
             return Err(not_found(key, &state));
         }
-        let next = versions.last().filter(|_| more).map(|version| Position {
-            revision: shown_at,
-            after: version.revision.to_string(),
-        });
+        let next = versions
+            .last()
+            .filter(|_| more)
+            .map(|version| Position { revision: shown_at, after: version.revision.to_string() });
         let items = versions.into_iter().map(|version| HistoryEntry {
             revision: version.revision,
             op: version.change.op,
@@ -116,7 +117,8 @@ impl ConfigService {
             subject: version.subject,
             request_id: version.request_id,
             paths: version.change.paths,
-            document: (full && version.change.op != Op::Delete).then(|| redacted(&version.change.document)),
+            document: (full && version.change.op != Op::Delete)
+                .then(|| redacted(&version.change.document)),
         });
         let page = Page {
             items: items.collect(),
@@ -127,9 +129,10 @@ impl ConfigService {
         Ok(answer(&state, page))
     }
 
-    /// Versions of a document before a revision, newest first, and whether there are more: up to `limit`, and with the
-    /// documents (`full`) a page's bytes of them. Without `full` a version comes without what its document holds. What is
-    /// not seen is passed over, as if it had not been.
+    /// Versions of a document before a revision, newest first, and whether there are more: up to
+    /// `limit`, and with the documents (`full`) a page's bytes of them. Without `full` a version
+    /// comes without what its document holds. What is not seen is passed over, as if it had not
+    /// been.
     async fn versions_below(
         &self,
         key: &Key,
@@ -181,11 +184,12 @@ impl ConfigService {
         let state = self.read_state(read).await?;
         view(&caller.claims).check_key(&state, key)?;
         let to = to.unwrap_or_else(|| state.revision());
-        let side = async |revision: u64| match self.seen_version(caller, &state, key, revision).await {
-            Ok(version) => Ok(Some(redacted(&version.change.document))),
-            Err(problem) if problem.code == Code::NotFound => Ok(None),
-            Err(problem) => Err(problem),
-        };
+        let side =
+            async |revision: u64| match self.seen_version(caller, &state, key, revision).await {
+                Ok(version) => Ok(Some(redacted(&version.change.document))),
+                Err(problem) if problem.code == Code::NotFound => Ok(None),
+                Err(problem) => Err(problem),
+            };
         let (old, new) = (side(from).await?, side(to).await?);
         if old.is_none() && new.is_none() {
             return Err(match state.get(key) {

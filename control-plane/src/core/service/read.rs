@@ -10,7 +10,9 @@ use super::super::committer::unavailable;
 use super::super::page::Position;
 use super::super::report;
 use super::super::secrets;
-use super::super::types::{Answer, Caller, Effective, ListQuery, Page, Place, ReadOptions, WatchQuery};
+use super::super::types::{
+    Answer, Caller, Effective, ListQuery, Page, Place, ReadOptions, WatchQuery,
+};
 use super::super::view::{may_reveal, view};
 use super::super::watch::{Filter, WatchStream, is_in_layer, trimmed};
 use super::{ConfigService, WAIT_FOR_REVISION, not_found, selector};
@@ -24,14 +26,11 @@ use blaze_domain::config::state::{State, redacted};
 const PAGE: u32 = 100;
 /// The same, at most.
 const MAX_PAGE: u32 = 1000;
-/// A page ends with the document that makes it this large, in bytes of JSON: then it fits into a message of gRPC.
+/// A page ends with the document that makes it this large, in bytes of JSON: then it fits into a
+/// message of gRPC.
 pub(super) const PAGE_BYTES: usize = 8 * 1024 * 1024;
 pub(super) fn answer<T>(state: &State, value: T) -> Answer<T> {
-    Answer {
-        revision: state.revision(),
-        replayed: false,
-        value,
-    }
+    Answer { revision: state.revision(), replayed: false, value }
 }
 
 pub(super) fn page_size(limit: Option<u32>) -> Result<usize, Problem> {
@@ -45,7 +44,8 @@ pub(super) fn page_size(limit: Option<u32>) -> Result<usize, Problem> {
 }
 
 impl ConfigService {
-    /// The state that a read shows: as new as every write acknowledged before it, unless older data is allowed.
+    /// The state that a read shows: as new as every write acknowledged before it, unless older data
+    /// is allowed.
     pub(super) async fn read_state(&self, read: &ReadOptions) -> Result<State, Problem> {
         // Where nobody else writes, a write is acknowledged after it can be read here.
         if !read.cached && !self.is_newest() {
@@ -71,7 +71,9 @@ impl ConfigService {
             Ok(Ok(_)) => Ok(()),
             _ => {
                 let revision = self.revision();
-                let detail = format!("the store is at revision {revision} and did not reach {wanted} within 5 s");
+                let detail = format!(
+                    "the store is at revision {revision} and did not reach {wanted} within 5 s"
+                );
                 Err(Problem::new(Code::RevisionUnknown, detail).at(revision))
             }
         }
@@ -100,8 +102,9 @@ impl ConfigService {
         Ok(state)
     }
 
-    /// Refuses a revision below the floor, as the store has it now: another process may have trimmed, or this one is
-    /// about it. What was read of the past before is whole if this succeeds.
+    /// Refuses a revision below the floor, as the store has it now: another process may have
+    /// trimmed, or this one is about it. What was read of the past before is whole if this
+    /// succeeds.
     pub(super) async fn check_floor(&self, now: &State, revision: u64) -> Result<(), Problem> {
         let batch = self.inner.store.commits_after(revision, 1).await;
         let floor = batch.map_err(|error| unavailable(&error))?.floor;
@@ -113,17 +116,19 @@ impl ConfigService {
     }
 
     /// The document as it may be shown: redacted, or in clear where that is asked and allowed.
-    async fn shown(&self, caller: &Caller, document: &Arc<Document>, reveal: bool) -> Result<Arc<Document>, Problem> {
+    async fn shown(
+        &self,
+        caller: &Caller,
+        document: &Arc<Document>,
+        reveal: bool,
+    ) -> Result<Arc<Document>, Problem> {
         if !reveal {
             return Ok(redacted(document));
         }
         self.check_reveal(caller, &[&document.key]).await?;
         let mut clear = (**document).clone();
-        clear.spec = Arc::new(secrets::revealed(
-            &self.inner.evaluator.keyring,
-            document,
-            &document.spec,
-        ));
+        clear.spec =
+            Arc::new(secrets::revealed(&self.inner.evaluator.keyring, document, &document.spec));
         Ok(Arc::new(clear))
     }
 
@@ -133,10 +138,8 @@ impl ConfigService {
         if !may_reveal(&caller.claims) {
             return Err(Problem::new(Code::PermissionDenied, "only an admin may reveal secrets"));
         }
-        let entries: Vec<_> = keys
-            .iter()
-            .map(|key| Self::entry(caller, "reveal", Some(key)))
-            .collect();
+        let entries: Vec<_> =
+            keys.iter().map(|key| Self::entry(caller, "reveal", Some(key))).collect();
         let written = self.inner.store.append_audit(&entries).await;
         written.map_err(|error| unavailable(&error))
     }
@@ -145,7 +148,12 @@ impl ConfigService {
     ///
     /// # Errors
     /// [`Problem`].
-    pub async fn get(&self, caller: &Caller, key: &Key, read: &ReadOptions) -> Result<Answer<Arc<Document>>, Problem> {
+    pub async fn get(
+        &self,
+        caller: &Caller,
+        key: &Key,
+        read: &ReadOptions,
+    ) -> Result<Answer<Arc<Document>>, Problem> {
         self.authorize(&caller.claims, Right::Read)?;
         let state = self.read_state(read).await?;
         view(&caller.claims).check_key(&state, key)?;
@@ -189,12 +197,9 @@ impl ConfigService {
             },
         };
         let after: Option<Key> = match &position {
-            Some(position) => Some(
-                position
-                    .after
-                    .parse()
-                    .map_err(|_| Problem::new(Code::InvalidPageToken, "the page token is not one of this query"))?,
-            ),
+            Some(position) => Some(position.after.parse().map_err(|_| {
+                Problem::new(Code::InvalidPageToken, "the page token is not one of this query")
+            })?),
             None => None,
         };
         if let (Some(service), Some(Kind::Instance)) = (&query.service, query.kind) {
@@ -214,9 +219,11 @@ impl ConfigService {
                 .is_none_or(|service| document.key.service_name() == Some(service))
                 && labels.as_ref().is_none_or(|labels| labels.matches(&document.labels))
                 && (!narrow
-                    || is_placed(&placement(&state, document), document, query) && view.sees_document(&state, document))
+                    || is_placed(&placement(&state, document), document, query)
+                        && view.sees_document(&state, document))
         };
-        let mut found = found_documents(&state, query.kind, after.as_ref()).filter(|(_, held)| matches(&held.document));
+        let mut found = found_documents(&state, query.kind, after.as_ref())
+            .filter(|(_, held)| matches(&held.document));
         let mut items: Vec<Arc<Document>> = Vec::new();
         let mut bytes = 0;
         for (_, held) in found.by_ref() {
@@ -247,7 +254,11 @@ impl ConfigService {
         Ok(answer(&state, page))
     }
 
-    async fn reveal_all(&self, caller: &Caller, items: Vec<Arc<Document>>) -> Result<Vec<Arc<Document>>, Problem> {
+    async fn reveal_all(
+        &self,
+        caller: &Caller,
+        items: Vec<Arc<Document>>,
+    ) -> Result<Vec<Arc<Document>>, Problem> {
         let keys: Vec<&Key> = items.iter().map(|document| &document.key).collect();
         self.check_reveal(caller, &keys).await?;
         let clear = items.iter().map(|document| {
@@ -283,11 +294,8 @@ impl ConfigService {
         let at = self.resolve(caller, &state, asked)?;
         let sources = Sources::at(&state, &at);
         if read.reveal {
-            let keys: Vec<Key> = sources
-                .parts()
-                .iter()
-                .map(|(document, _, _)| document.key.clone())
-                .collect();
+            let keys: Vec<Key> =
+                sources.parts().iter().map(|(document, _, _)| document.key.clone()).collect();
             self.check_reveal(caller, &keys.iter().collect::<Vec<_>>()).await?;
         }
         let keyring = Arc::clone(&self.inner.evaluator.keyring);
@@ -326,8 +334,9 @@ impl ConfigService {
             node: asked.node.clone(),
         };
         // Programs are there also without a document, as for workers.
-        let has_no_document =
-            |service: &ServiceName| PROGRAMS.contains(&service.as_str()) && state.get(&Key::service(service)).is_none();
+        let has_no_document = |service: &ServiceName| {
+            PROGRAMS.contains(&service.as_str()) && state.get(&Key::service(service)).is_none()
+        };
         let service = match &asked.service {
             Some(service) if !has_no_document(service) => Some(exists(Key::service(service))?),
             Some(_) | None => None,
@@ -337,7 +346,8 @@ impl ConfigService {
         }
         if let Some(node) = &asked.node {
             let held = exists(Key::node(node))?;
-            let own: Option<LayerName> = held.document.spec_layer().and_then(|layer| layer.parse().ok());
+            let own: Option<LayerName> =
+                held.document.spec_layer().and_then(|layer| layer.parse().ok());
             if asked.layer.is_some() && asked.layer != own {
                 return invalid(&format!("node {node} is in another layer"));
             }
@@ -352,7 +362,9 @@ impl ConfigService {
         }
         if let Some(layer) = &at.layer {
             view.check_layer(layer)?;
-            if let Some(service) = service.filter(|held| !held.document.is_for_layer(layer.as_str())) {
+            if let Some(service) =
+                service.filter(|held| !held.document.is_for_layer(layer.as_str()))
+            {
                 let detail = format!("{} is not for layer {layer}", service.document.key);
                 return Err(Problem::new(Code::NotFound, detail));
             }
@@ -364,7 +376,11 @@ impl ConfigService {
     ///
     /// # Errors
     /// [`Code::RevisionTrimmed`], [`Code::RevisionUnknown`]: list, then watch. Other [`Problem`]s.
-    pub async fn watch(&self, caller: &Caller, query: &WatchQuery) -> Result<Answer<WatchStream>, Problem> {
+    pub async fn watch(
+        &self,
+        caller: &Caller,
+        query: &WatchQuery,
+    ) -> Result<Answer<WatchStream>, Problem> {
         self.watch_with(caller, query, &ReadOptions::default()).await
     }
 
@@ -404,14 +420,20 @@ impl ConfigService {
     }
 }
 
-/// To a token that is bound to a layer, an instance with a document elsewhere is what one without a document is, for the one
-/// must not be told from the other: none where a place is asked for, outside of the view where its own place is.
-fn without_foreign_instance(caller: &Caller, mut state: State, asked: &Place) -> Result<State, Problem> {
+/// To a token that is bound to a layer, an instance with a document elsewhere is what one without a
+/// document is, for the one must not be told from the other: none where a place is asked for,
+/// outside of the view where its own place is.
+fn without_foreign_instance(
+    caller: &Caller,
+    mut state: State,
+    asked: &Place,
+) -> Result<State, Problem> {
     if let (Some(service), Some(instance)) = (&asked.service, &asked.instance) {
         let key = Key::instance(service.clone(), DocumentName::from(instance));
         let view = view(&caller.claims);
         let is_seen = state.get(&key).map(|held| view.sees_document(&state, &held.document));
-        if view.is_bound() && is_seen != Some(true) && asked.node.is_none() && asked.layer.is_none() {
+        if view.is_bound() && is_seen != Some(true) && asked.node.is_none() && asked.layer.is_none()
+        {
             return Err(view.outside(&key.to_string()));
         }
         if is_seen == Some(false) {
@@ -423,28 +445,14 @@ fn without_foreign_instance(caller: &Caller, mut state: State, asked: &Place) ->
 
 /// Everything that the next page's request must repeat.
 fn bound_query(caller: &Caller, query: &ListQuery) -> String {
-    let ListQuery {
-        kind,
-        service,
-        layer,
-        node,
-        label_selector,
-        limit: _,
-        page_token: _,
-    } = query;
+    let ListQuery { kind, service, layer, node, label_selector, limit: _, page_token: _ } = query;
     let bound = &caller.claims.layer;
     format!("list {kind:?} {service:?} {layer:?} {node:?} {label_selector:?} {bound:?}")
 }
 
 fn is_placed(placement: &Placement, document: &Document, query: &ListQuery) -> bool {
-    query
-        .layer
-        .as_ref()
-        .is_none_or(|layer| is_in_layer(&document.key, placement, layer))
-        && query
-            .node
-            .as_ref()
-            .is_none_or(|node| placement.node.as_ref() == Some(node))
+    query.layer.as_ref().is_none_or(|layer| is_in_layer(&document.key, placement, layer))
+        && query.node.as_ref().is_none_or(|node| placement.node.as_ref() == Some(node))
 }
 
 fn found_documents<'a>(
@@ -457,9 +465,7 @@ fn found_documents<'a>(
         None => {
             let after = after.cloned();
             Box::new(
-                state
-                    .all()
-                    .filter(move |(key, _)| after.as_ref().is_none_or(|after| *key > after)),
+                state.all().filter(move |(key, _)| after.as_ref().is_none_or(|after| *key > after)),
             )
         }
     }

@@ -1,4 +1,5 @@
-//! What a worker is told: the whole view of its layer or what was committed since it was last here, then every commit.
+//! What a worker is told: the whole view of its layer or what was committed since it was last here,
+//! then every commit.
 //!
 //! ```text
 //! Hello ─▶ Welcome ─▶ (Snapshot … Snapshot, last) ─▶ Commit, Commit, Bookmark, … ─▶ GoAway
@@ -28,18 +29,21 @@ use super::ConfigService;
 use crate::auth::Right;
 use crate::secrets::Keyring;
 
-/// The protocol of `Sync` that is spoken here. Version 2: Hello says whether texts of secrets are wanted.
+/// The protocol of `Sync` that is spoken here. Version 2: Hello says whether texts of secrets are
+/// wanted.
 pub const SYNC_PROTOCOL: u32 = 2;
 /// The oldest one that is spoken here.
 pub const OLDEST_SYNC_PROTOCOL: u32 = SYNC_PROTOCOL - 1;
-/// A part of a snapshot ends with the document that makes it this large, in bytes of JSON: with the largest document it is
-/// still below the 1 MiB that a part may have.
+/// A part of a snapshot ends with the document that makes it this large, in bytes of JSON: with the
+/// largest document it is still below the 1 MiB that a part may have.
 const PART_BYTES: usize = 512 * 1024;
 /// What a document takes besides its spec, labels and annotations, about.
 const OVERHEAD_BYTES: usize = 512;
-/// Snapshots that are on their way at once: after an outage everybody wants one, and users are to be answered meanwhile.
+/// Snapshots that are on their way at once: after an outage everybody wants one, and users are to
+/// be answered meanwhile.
 pub(super) const SNAPSHOTS: usize = 8;
-/// Whoever has waited for its turn so long gets its snapshot beside the others: some of those may read slowly, or not at all.
+/// Whoever has waited for its turn so long gets its snapshot beside the others: some of those may
+/// read slowly, or not at all.
 const TURN: Duration = Duration::from_secs(2);
 /// When a worker is told to come again: not all at once.
 const AGAIN_MS: std::ops::Range<u32> = 100..2000;
@@ -147,7 +151,8 @@ impl Clear {
         Arc::new(clear)
     }
 
-    /// Of what is gone the name is enough: with everything that a layer lost at once the message could be too large.
+    /// Of what is gone the name is enough: with everything that a layer lost at once the message
+    /// could be too large.
     fn changed(&self, op: WatchOp, held: &Arc<Document>) -> Arc<Document> {
         match op {
             WatchOp::Create | WatchOp::Update => self.document(held),
@@ -174,11 +179,17 @@ impl Clear {
 }
 
 impl ConfigService {
-    /// Opens a worker's stream. `is_safe`: nobody else can read what is sent (TLS, or this machine alone).
+    /// Opens a worker's stream. `is_safe`: nobody else can read what is sent (TLS, or this machine
+    /// alone).
     ///
     /// # Errors
     /// [`Problem`]: the token is not that layer's worker's, the greeting makes no sense, or the store does not answer.
-    pub async fn sync(&self, caller: &Caller, hello: SyncHello, is_safe: bool) -> Result<SyncStream, Problem> {
+    pub async fn sync(
+        &self,
+        caller: &Caller,
+        hello: SyncHello,
+        is_safe: bool,
+    ) -> Result<SyncStream, Problem> {
         self.authorize(&caller.claims, Right::Sync)?;
         view(&caller.claims).check_layer(&hello.layer)?;
         check_hello(&hello)?;
@@ -192,7 +203,8 @@ impl ConfigService {
             with_texts: is_safe && !hello.without_texts,
         };
         tracing::info!(
-            layer = %hello.layer, node = hello.node.as_ref().map(NodeName::as_str), worker = hello.worker_id,
+            layer = %hello.layer, node = hello.node.as_ref().map(NodeName::as_str),
+            worker = hello.worker_id,
             version = hello.version, revision = hello.revision, resumed, "a worker has come"
         );
         let welcome = SyncItem::Welcome {
@@ -207,7 +219,8 @@ impl ConfigService {
         };
         let watch = self.inner.watches.open_stored(caller, &hello.layer, since);
         let service = self.clone();
-        let told = watch.flat_map(move |item| stream::iter(service.told(&hello.layer, &clear, item)));
+        let told =
+            watch.flat_map(move |item| stream::iter(service.told(&hello.layer, &clear, item)));
         let first = stream::iter([welcome]);
         Ok(SyncStream {
             items: first.chain(snapshot).chain(told).boxed(),
@@ -232,9 +245,13 @@ impl ConfigService {
         entered.map_err(|error| Problem::new(Code::Overloaded, error.to_string()).retry_after(30))
     }
 
-    /// Whether the commits after what a worker has are all there, and what it has is what it should have.
+    /// Whether the commits after what a worker has are all there, and what it has is what it should
+    /// have.
     async fn can_resume(&self, hello: &SyncHello, state: &State) -> bool {
-        if hello.store_id != self.inner.store_id || hello.revision == 0 || hello.revision > state.revision() {
+        if hello.store_id != self.inner.store_id
+            || hello.revision == 0
+            || hello.revision > state.revision()
+        {
             return false;
         }
         if self.check_floor(state, hello.revision).await.is_err() {
@@ -250,7 +267,12 @@ impl ConfigService {
     }
 
     /// The view of a layer, in parts.
-    fn snapshot(&self, state: State, layer: LayerName, clear: Clear) -> BoxStream<'static, SyncItem> {
+    fn snapshot(
+        &self,
+        state: State,
+        layer: LayerName,
+        clear: Clear,
+    ) -> BoxStream<'static, SyncItem> {
         let room = Arc::clone(&self.inner.snapshots);
         let begin = async move {
             // It is never closed.
@@ -283,15 +305,16 @@ impl ConfigService {
             WatchItem::Bookmark(revision) => {
                 let state = self.inner.log.state_at(revision);
                 let digest = state.map(|state| self.inner.digests.of(&state, layer));
-                vec![SyncItem::Bookmark {
-                    revision,
-                    digest: digest.unwrap_or_default(),
-                }]
+                vec![SyncItem::Bookmark { revision, digest: digest.unwrap_or_default() }]
             }
-            WatchItem::End(None) => vec![go_away("the stream has been open for long"), SyncItem::End(None)],
+            WatchItem::End(None) => {
+                vec![go_away("the stream has been open for long"), SyncItem::End(None)]
+            }
             WatchItem::End(Some(problem)) => match problem.code {
                 Code::ShuttingDown => vec![go_away("the service is ending"), SyncItem::End(None)],
-                Code::RevisionTrimmed => vec![go_away("the history was trimmed"), SyncItem::End(None)],
+                Code::RevisionTrimmed => {
+                    vec![go_away("the history was trimmed"), SyncItem::End(None)]
+                }
                 _ => vec![SyncItem::End(Some(problem))],
             },
         }
@@ -322,17 +345,15 @@ impl Iterator for Parts {
             documents.push(self.clear.document(&held.document));
         }
         self.has_ended = self.held.peek().is_none();
-        Some(SyncItem::Snapshot {
-            revision: self.revision,
-            documents,
-            last: self.has_ended,
-        })
+        Some(SyncItem::Snapshot { revision: self.revision, documents, last: self.has_ended })
     }
 }
 
 fn size(held: &Held) -> usize {
     let words = held.document.labels.iter().chain(&held.document.annotations);
-    held.bytes + words.map(|(name, value)| name.len() + value.len() + 8).sum::<usize>() + OVERHEAD_BYTES
+    held.bytes
+        + words.map(|(name, value)| name.len() + value.len() + 8).sum::<usize>()
+        + OVERHEAD_BYTES
 }
 
 fn check_hello(hello: &SyncHello) -> Result<(), Problem> {
@@ -341,7 +362,9 @@ fn check_hello(hello: &SyncHello) -> Result<(), Problem> {
         SyncHello { worker_id, .. } if worker_id.is_empty() => {
             "worker_id is empty: several workers could not be told apart"
         }
-        SyncHello { worker_id, version, .. } if worker_id.len().max(version.len()) > MAX_ID_BYTES => {
+        SyncHello { worker_id, version, .. }
+            if worker_id.len().max(version.len()) > MAX_ID_BYTES =>
+        {
             "worker_id or version has more than 256 bytes"
         }
         SyncHello { store_id, digest, .. } if store_id.len().max(digest.len()) > MAX_ID_BYTES => {

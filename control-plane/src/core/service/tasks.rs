@@ -1,4 +1,5 @@
-//! The tasks of the core: committing, following other processes, looking at the store, trimming, revocations, audit.
+//! The tasks of the core: committing, following other processes, looking at the store, trimming,
+//! revocations, audit.
 
 use std::time::Duration;
 
@@ -38,7 +39,8 @@ pub(super) struct Parts {
 
 impl ConfigService {
     pub(super) fn spawn_tasks(&self, supervisor: &Supervisor, parts: Parts) {
-        // All of them live as long as the process: at its end they are told by the token, after the streams have ended.
+        // All of them live as long as the process: at its end they are told by the token, after the
+        // streams have ended.
         let stop = supervisor.shutdown_token();
         let until = |future: futures::future::BoxFuture<'static, ()>| {
             let stop = stop.clone();
@@ -49,9 +51,7 @@ impl ConfigService {
                 }
             }
         };
-        parts
-            .readiness
-            .add("store", Gate::Decides, CheckStatus::Ok, self.described());
+        parts.readiness.add("store", Gate::Decides, CheckStatus::Ok, self.described());
         let spawn = |name: &str, future| {
             supervisor.spawn(name, TaskPolicy::Essential, until(future));
         };
@@ -151,8 +151,8 @@ impl ConfigService {
         self.remove_expired(history).await
     }
 
-    /// Answers to repeat, tokens and audit that have expired go with a trimming, also with one that leaves the floor
-    /// where it is. A shared store removes them by itself.
+    /// Answers to repeat, tokens and audit that have expired go with a trimming, also with one that
+    /// leaves the floor where it is. A shared store removes them by itself.
     async fn remove_expired(&self, history: &HistorySection) -> Result<(), StoreError> {
         if !self.inner.store.is_shared() {
             let floor = self.inner.log.floor();

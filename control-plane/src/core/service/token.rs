@@ -37,10 +37,7 @@ pub(super) struct DenialLimit {
 impl DenialLimit {
     fn admit(&mut self, address: IpAddr) -> bool {
         let now = Instant::now();
-        if self
-            .second
-            .is_none_or(|since| now.duration_since(since) >= Duration::from_secs(1))
-        {
+        if self.second.is_none_or(|since| now.duration_since(since) >= Duration::from_secs(1)) {
             self.second = Some(now);
             self.counts.clear();
         }
@@ -56,7 +53,8 @@ impl DenialLimit {
 }
 
 impl ConfigService {
-    /// Notes a refusal (401, 403) for the audit: at most ten per address and second, the rest is counted.
+    /// Notes a refusal (401, 403) for the audit: at most ten per address and second, the rest is
+    /// counted.
     #[allow(clippy::too_many_arguments, reason = "each is a column of the audit")]
     pub fn denied(
         &self,
@@ -137,20 +135,17 @@ impl ConfigService {
             _ => return Err(Problem::new(Code::InvalidRequest, format!("limit: 1 to {MAX_PAGE}"))),
         };
         query.limit = limit + 1;
-        let mut items = self
-            .inner
-            .store
-            .audit(&query)
-            .await
-            .map_err(|error| unavailable(&error))?;
+        let mut items =
+            self.inner.store.audit(&query).await.map_err(|error| unavailable(&error))?;
         let more = items.len() > limit;
         items.truncate(limit);
-        // A commit that is not in the state yet is not told of, or a read that follows would be older than this one.
+        // A commit that is not in the state yet is not told of, or a read that follows would be
+        // older than this one.
         items.retain(|entry| entry.revision.is_none_or(|revision| revision <= state.revision()));
-        let next = items.last().filter(|_| more).map(|entry| Position {
-            revision: state.revision(),
-            after: entry.id.clone(),
-        });
+        let next = items
+            .last()
+            .filter(|_| more)
+            .map(|entry| Position { revision: state.revision(), after: entry.id.clone() });
         Ok(Answer {
             revision: state.revision(),
             replayed: false,
@@ -209,31 +204,22 @@ impl ConfigService {
         let entry = Self::entry(caller, "token_create", None);
         let added = self.inner.store.add_token(&record, &entry).await;
         added.map_err(|error| outcome_unknown(&error))?;
-        Ok(Answer {
-            revision: self.revision(),
-            replayed: false,
-            value: (record, text),
-        })
+        Ok(Answer { revision: self.revision(), replayed: false, value: (record, text) })
     }
 
     /// Tokens that were given out and have not run out.
     ///
     /// # Errors
     /// [`Problem`].
-    pub async fn tokens(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Vec<TokenRecord>>, Problem> {
+    pub async fn tokens(
+        &self,
+        caller: &Caller,
+        read: &ReadOptions,
+    ) -> Result<Answer<Vec<TokenRecord>>, Problem> {
         authorize_whole(&caller.claims)?;
         let state = self.read_state(read).await?;
-        let tokens = self
-            .inner
-            .store
-            .tokens(now())
-            .await
-            .map_err(|error| unavailable(&error))?;
-        Ok(Answer {
-            revision: state.revision(),
-            replayed: false,
-            value: tokens,
-        })
+        let tokens = self.inner.store.tokens(now()).await.map_err(|error| unavailable(&error))?;
+        Ok(Answer { revision: state.revision(), replayed: false, value: tokens })
     }
 
     /// Takes a token back: it is refused everywhere within five seconds and its streams end.
@@ -251,11 +237,7 @@ impl ConfigService {
             // It is revoked; the next periodic reading learns of it.
             tracing::warn!(%error, "revoked tokens were not read");
         }
-        Ok(Answer {
-            revision: self.revision(),
-            replayed: false,
-            value: (),
-        })
+        Ok(Answer { revision: self.revision(), replayed: false, value: () })
     }
 
     /// Reads which tokens are revoked.
@@ -292,9 +274,7 @@ fn check_token(request: &TokenRequest) -> Result<(), Problem> {
         id: "0",
     };
     token.check().map_err(|detail| {
-        let pointer = ["subject", "layer"]
-            .into_iter()
-            .find(|member| detail.starts_with(member));
+        let pointer = ["subject", "layer"].into_iter().find(|member| detail.starts_with(member));
         invalid(&format!("/{}", pointer.unwrap_or("roles")), detail)
     })
 }
@@ -339,21 +319,13 @@ mod tests {
                 expire_time,
                 revoke_time: None,
             };
-            let made = AuditEntry {
-                id: format!("a-{id}"),
-                ..entry.clone()
-            };
+            let made = AuditEntry { id: format!("a-{id}"), ..entry.clone() };
             store.add_token(&token, &made).await.unwrap();
-            let again = AuditEntry {
-                id: format!("b-{id}"),
-                ..entry.clone()
-            };
+            let again = AuditEntry { id: format!("b-{id}"), ..entry.clone() };
             assert!(store.revoke_token(id, ago(500), &again).await.unwrap());
         }
         let shared = Arc::clone(&store) as Arc<dyn Store>;
-        let service = testing::service_on(&supervisor, shared, &[("e1", [7; 32])])
-            .await
-            .unwrap();
+        let service = testing::service_on(&supervisor, shared, &[("e1", [7; 32])]).await.unwrap();
         let revocations = &service.inner.revocations;
         assert!(revocations.is_revoked("late") && !revocations.is_revoked("old"));
     }

@@ -19,7 +19,11 @@ impl ConfigService {
     ///
     /// # Errors
     /// [`Problem`].
-    pub async fn topology(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Value>, Problem> {
+    pub async fn topology(
+        &self,
+        caller: &Caller,
+        read: &ReadOptions,
+    ) -> Result<Answer<Value>, Problem> {
         self.authorize(&caller.claims, Right::Read)?;
         let state = self.read_state(read).await?;
         let view = view(&caller.claims);
@@ -33,7 +37,8 @@ impl ConfigService {
                 json!({
                     "name": layer.as_str(),
                     "kind": held.document.spec_member("kind"),
-                    "nodes": nodes.map(|key| node_json(&state, &view, &fleet, key)).collect::<Vec<_>>(),
+                    "nodes": nodes.map(|key| node_json(&state, &view, &fleet,
+                        key)).collect::<Vec<_>>(),
                 })
             });
         let layers: Vec<Value> = layers.collect();
@@ -45,7 +50,11 @@ impl ConfigService {
     ///
     /// # Errors
     /// [`Problem`].
-    pub async fn workers(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Value>, Problem> {
+    pub async fn workers(
+        &self,
+        caller: &Caller,
+        read: &ReadOptions,
+    ) -> Result<Answer<Value>, Problem> {
         self.authorize(&caller.claims, Right::Read)?;
         let state = self.read_state(read).await?;
         let fleet = self.fleet(&state, &view(&caller.claims));
@@ -69,7 +78,8 @@ impl ConfigService {
         view(&caller.claims).check_layer(layer)?;
         let key = Key::layer(layer);
         state.get(&key).ok_or_else(|| not_found(&key, &state))?;
-        let value = json!({ "revision": state.revision(), "digest": self.inner.digests.of(&state, layer) });
+        let value =
+            json!({ "revision": state.revision(), "digest": self.inner.digests.of(&state, layer) });
         Ok(answer(&state, value))
     }
 }
@@ -90,9 +100,12 @@ impl Known {
     fn to_json(&self) -> Value {
         let Self { name, worker, in_sync } = self;
         json!({
-            "layer": name.layer.as_str(), "node": name.node.as_ref().map(NodeName::as_str), "worker_id": name.id,
-            "version": worker.version, "connected": worker.is_connected(), "revision": worker.has.revision,
-            "digest": worker.has.digest, "in_sync": in_sync, "last_seen": worker.last_seen.to_string(),
+            "layer": name.layer.as_str(), "node": name.node.as_ref().map(NodeName::as_str),
+            "worker_id": name.id,
+            "version": worker.version, "connected": worker.is_connected(),
+            "revision": worker.has.revision,
+            "digest": worker.has.digest, "in_sync": in_sync,
+            "last_seen": worker.last_seen.to_string(),
         })
     }
 }
@@ -100,12 +113,11 @@ impl Known {
 impl ConfigService {
     fn fleet(&self, state: &State, view: &View) -> Fleet {
         let known = self.inner.workers.list(|name| view.check_layer(&name.layer).is_ok());
-        let mut fleet = Fleet {
-            workers: Vec::with_capacity(known.len()),
-            running: BTreeMap::new(),
-        };
+        let mut fleet =
+            Fleet { workers: Vec::with_capacity(known.len()), running: BTreeMap::new() };
         for (name, worker) in known {
-            let in_sync = worker.is_connected() && worker.has.digest == self.inner.digests.of(state, &name.layer);
+            let in_sync = worker.is_connected()
+                && worker.has.digest == self.inner.digests.of(state, &name.layer);
             if worker.is_connected() {
                 let services = worker.has.services.iter();
                 fleet
@@ -117,7 +129,8 @@ impl ConfigService {
         fleet
     }
 
-    /// How far connected workers are behind, by layer and node; of several on one node the one that is furthest behind.
+    /// How far connected workers are behind, by layer and node; of several on one node the one that
+    /// is furthest behind.
     #[must_use]
     pub fn worker_lags(&self) -> BTreeMap<(LayerName, Option<NodeName>), u64> {
         let (mut lags, newest) = (BTreeMap::new(), self.revision());
@@ -131,12 +144,10 @@ impl ConfigService {
     }
 }
 
-/// The worker of a node: one that is connected before one that has gone, then the one that was seen last.
+/// The worker of a node: one that is connected before one that has gone, then the one that was seen
+/// last.
 fn worker_json(fleet: &Fleet, node: &NodeName) -> Value {
-    let of_node = fleet
-        .workers
-        .iter()
-        .filter(|known| known.name.node.as_ref() == Some(node));
+    let of_node = fleet.workers.iter().filter(|known| known.name.node.as_ref() == Some(node));
     match of_node.max_by_key(|known| (known.worker.is_connected(), known.worker.last_seen)) {
         Some(known) => json!({
             "connected": known.worker.is_connected(), "revision": known.worker.has.revision,
@@ -148,9 +159,7 @@ fn worker_json(fleet: &Fleet, node: &NodeName) -> Value {
 
 fn node_json(state: &State, view: &View, fleet: &Fleet, key: &Key) -> Value {
     let node = NodeName::from(key.name());
-    let kind = state
-        .get(key)
-        .and_then(|held| held.document.spec_member("type").cloned());
+    let kind = state.get(key).and_then(|held| held.document.spec_member("type").cloned());
     let seen = |key: &&Key| {
         let held = state.get(key);
         held.is_some_and(|held| view.sees_document(state, &held.document))
@@ -160,10 +169,7 @@ fn node_json(state: &State, view: &View, fleet: &Fleet, key: &Key) -> Value {
         let instance = InstanceName::from(key.name());
         Some((key.service_name()?.clone(), instance))
     });
-    let runs = fleet
-        .running
-        .keys()
-        .filter(|running| running.node.as_ref() == Some(&node));
+    let runs = fleet.running.keys().filter(|running| running.node.as_ref() == Some(&node));
     let runs = runs.map(|running| (running.service.clone(), running.instance.clone()));
     let services: BTreeSet<(ServiceName, InstanceName)> = placed.chain(runs).collect();
     let services = services.into_iter().map(|(service, instance)| {

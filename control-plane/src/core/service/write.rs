@@ -1,4 +1,5 @@
-//! Writes: each becomes a request for the committer. A write that has begun goes on when whoever asked goes away.
+//! Writes: each becomes a request for the committer. A write that has begun goes on when whoever
+//! asked goes away.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,11 +11,14 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::oneshot;
 
 use super::super::affected::MAX_CANDIDATES;
-use super::super::committer::{Finished, Once, QUEUE_BYTES, Queued, Running, now, outcome_unknown, unavailable};
+use super::super::committer::{
+    Finished, Once, QUEUE_BYTES, Queued, Running, now, outcome_unknown, unavailable,
+};
 use super::super::evaluate::{Content, Form, Item, Prune, Request};
 use super::super::report::{AnswerKind, Done, report_from, written_from};
 use super::super::types::{
-    Answer, ApplyReport, ApplyRequest, Caller, DocumentInput, Idempotency, Precondition, ReadOptions, Written,
+    Answer, ApplyReport, ApplyRequest, Caller, DocumentInput, Idempotency, Precondition,
+    ReadOptions, Written,
 };
 use super::super::view::{authorize_whole, view};
 use super::super::watch::trimmed;
@@ -41,20 +45,13 @@ fn request(caller: &Caller, action: &'static str, form: Form, items: Vec<Item>) 
 }
 
 fn item(key: Key, content: Content, precondition: Precondition) -> Item {
-    Item {
-        key,
-        content,
-        precondition,
-    }
+    Item { key, content, precondition }
 }
 
 fn internal(what: &str) -> Problem {
     tracing::error!(what, "an answer could not be made");
-    Problem::new(
-        Code::Internal,
-        "the answer could not be made; see the log of the service",
-    )
-    .applied(Applied::Unknown)
+    Problem::new(Code::Internal, "the answer could not be made; see the log of the service")
+        .applied(Applied::Unknown)
 }
 
 impl ConfigService {
@@ -68,7 +65,12 @@ impl ConfigService {
         self.check_view_of(caller, key, true).await
     }
 
-    async fn check_view_of(&self, caller: &Caller, key: &Key, must_exist: bool) -> Result<(), Problem> {
+    async fn check_view_of(
+        &self,
+        caller: &Caller,
+        key: &Key,
+        must_exist: bool,
+    ) -> Result<(), Problem> {
         let view = view(&caller.claims);
         if view.layer().is_none() {
             return Ok(());
@@ -95,29 +97,26 @@ impl ConfigService {
             problem.at(self.revision())
         };
         let running = match &once {
-            Some(once) => Some(Running::begin(&self.inner.running, &once.id).ok_or_else(in_progress)?),
+            Some(once) => {
+                Some(Running::begin(&self.inner.running, &once.id).ok_or_else(in_progress)?)
+            }
             None => None,
         };
-        let overloaded =
-            || Problem::new(Code::Overloaded, "too many writes wait for the store; try again").retry_after(1);
+        let overloaded = || {
+            Problem::new(Code::Overloaded, "too many writes wait for the store; try again")
+                .retry_after(1)
+        };
         let bytes = (bytes + REQUEST_BYTES).min(QUEUE_BYTES);
         let room = Arc::clone(&self.inner.room);
         let room = room.try_acquire_many_owned(u32::try_from(bytes).unwrap_or(u32::MAX));
         let room = room.map_err(|_| overloaded())?;
         let (reply, result) = oneshot::channel();
-        let queued = Queued {
-            request: Arc::new(request),
-            answer,
-            once,
-            bytes,
-            reply,
-            running,
-            _room: room,
-        };
+        let queued =
+            Queued { request: Arc::new(request), answer, once, bytes, reply, running, _room: room };
         self.inner.queue.try_send(queued).map_err(|_| overloaded())?;
         let ended = || {
-            let detail =
-                "the service ended before the store answered: read the documents to see whether it took effect";
+            let detail = "the service ended before the store answered: read the documents to see \
+                whether it took effect";
             Problem::new(Code::ShuttingDown, detail).applied(Applied::Unknown)
         };
         result.await.map_err(|_| ended())?
@@ -138,7 +137,8 @@ impl ConfigService {
             Finished::Before(revision, text) => Ok(Answer {
                 revision,
                 replayed: true,
-                value: written_from(&text).ok_or_else(|| internal("a kept answer cannot be read"))?,
+                value: written_from(&text)
+                    .ok_or_else(|| internal("a kept answer cannot be read"))?,
             }),
         }
     }
@@ -163,7 +163,8 @@ impl ConfigService {
             Finished::Before(revision, text) => Ok(Answer {
                 revision,
                 replayed: true,
-                value: report_from(&text).ok_or_else(|| internal("a kept answer cannot be read"))?,
+                value: report_from(&text)
+                    .ok_or_else(|| internal("a kept answer cannot be read"))?,
             }),
         }
     }
@@ -182,13 +183,8 @@ impl ConfigService {
         self.check_view(caller, &input.key).await?;
         let bytes = input.spec.to_string().len();
         let item = item(input.key.clone(), Content::Write(input), Precondition::None);
-        let action = if item.key.kind() == Kind::Rollout {
-            "rollout_start"
-        } else {
-            "create"
-        };
-        self.write_one(request(caller, action, Form::Create, vec![item]), idempotency, bytes)
-            .await
+        let action = if item.key.kind() == Kind::Rollout { "rollout_start" } else { "create" };
+        self.write_one(request(caller, action, Form::Create, vec![item]), idempotency, bytes).await
     }
 
     /// Replaces a document, or makes it.
@@ -203,13 +199,16 @@ impl ConfigService {
     ) -> Result<Answer<Written>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
         match precondition {
-            Precondition::Revisions(_) | Precondition::Any => self.check_view_of_existing(caller, &input.key).await?,
-            Precondition::None | Precondition::Absent => self.check_view(caller, &input.key).await?,
+            Precondition::Revisions(_) | Precondition::Any => {
+                self.check_view_of_existing(caller, &input.key).await?
+            }
+            Precondition::None | Precondition::Absent => {
+                self.check_view(caller, &input.key).await?
+            }
         }
         let bytes = input.spec.to_string().len();
         let item = item(input.key.clone(), Content::Write(input), precondition);
-        self.write_one(request(caller, "update", Form::Single, vec![item]), None, bytes)
-            .await
+        self.write_one(request(caller, "update", Form::Single, vec![item]), None, bytes).await
     }
 
     /// Changes a document by a merge patch of its labels, annotations and spec.
@@ -227,8 +226,7 @@ impl ConfigService {
         self.check_view_of_existing(caller, key).await?;
         let bytes = merge_patch.to_string().len();
         let item = item(key.clone(), Content::Patch(merge_patch), precondition);
-        self.write_one(request(caller, "patch", Form::Single, vec![item]), None, bytes)
-            .await
+        self.write_one(request(caller, "patch", Form::Single, vec![item]), None, bytes).await
     }
 
     /// Deletes a document; with `cascade` also those that refer to it.
@@ -252,11 +250,7 @@ impl ConfigService {
             Finished::Done(done) => done.revision,
             Finished::Before(revision, _) => revision,
         };
-        Ok(Answer {
-            revision,
-            replayed: false,
-            value: (),
-        })
+        Ok(Answer { revision, replayed: false, value: () })
     }
 
     /// Many documents in one commit, or none of them.
@@ -271,17 +265,12 @@ impl ConfigService {
     ) -> Result<Answer<ApplyReport>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
         if asked.items.len() > MAX_ITEMS {
-            let detail = format!(
-                "{} documents, at most {MAX_ITEMS} are allowed at once",
-                asked.items.len()
-            );
+            let detail =
+                format!("{} documents, at most {MAX_ITEMS} are allowed at once", asked.items.len());
             return Err(Problem::new(Code::PayloadTooLarge, detail));
         }
         let prune = match &asked.prune {
-            Some(text) => Some(Prune {
-                selector: selector(text)?,
-                confirm: asked.prune_confirm,
-            }),
+            Some(text) => Some(Prune { selector: selector(text)?, confirm: asked.prune_confirm }),
             None => None,
         };
         let bytes = asked.items.iter().map(|item| item.input.spec.to_string().len()).sum();
@@ -290,11 +279,8 @@ impl ConfigService {
                 Some(revision) => Precondition::Revisions(vec![revision]),
                 None => Precondition::None,
             };
-            let content = if one.delete {
-                Content::Delete
-            } else {
-                Content::Write(one.input.clone())
-            };
+            let content =
+                if one.delete { Content::Delete } else { Content::Write(one.input.clone()) };
             item(one.input.key, content, precondition)
         });
         let mut request = request(caller, "apply", Form::Many, items.collect());
@@ -306,9 +292,15 @@ impl ConfigService {
     }
 
     /// The same checks, and nothing is written.
-    async fn dry_run(&self, request: Request, bytes: usize) -> Result<Answer<ApplyReport>, Problem> {
-        let overloaded =
-            || Problem::new(Code::Overloaded, "too many dry runs wait for each other; try again").retry_after(1);
+    async fn dry_run(
+        &self,
+        request: Request,
+        bytes: usize,
+    ) -> Result<Answer<ApplyReport>, Problem> {
+        let overloaded = || {
+            Problem::new(Code::Overloaded, "too many dry runs wait for each other; try again")
+                .retry_after(1)
+        };
         let _waiting = self.inner.dry_waiting.try_acquire().map_err(|_| overloaded())?;
         let bytes = u32::try_from((bytes + REQUEST_BYTES).min(QUEUE_BYTES)).unwrap_or(u32::MAX);
         let room = Arc::clone(&self.inner.room).try_acquire_many_owned(bytes);
@@ -338,7 +330,8 @@ impl ConfigService {
         Ok(Answer {
             revision,
             replayed: false,
-            value: report.map_err(|_| internal("the report of a dry run").applied(Applied::No))??,
+            value: report
+                .map_err(|_| internal("the report of a dry run").applied(Applied::No))??,
         })
     }
 
@@ -367,13 +360,8 @@ impl ConfigService {
             }
             other => other?,
         };
-        let item = item(
-            key.clone(),
-            Content::Restore(Some(version.change.document)),
-            precondition,
-        );
-        self.write_one(request(caller, "rollback", Form::Single, vec![item]), idempotency, 0)
-            .await
+        let item = item(key.clone(), Content::Restore(Some(version.change.document)), precondition);
+        self.write_one(request(caller, "rollback", Form::Single, vec![item]), idempotency, 0).await
     }
 
     /// Gives every document that a commit changed the content that it had before, in one commit.
@@ -400,16 +388,9 @@ impl ConfigService {
                 "what commit {revision} did is no longer kept: the history begins after {}",
                 batch.floor
             );
-            return Err(Problem {
-                detail,
-                ..trimmed(batch.floor, state.revision())
-            });
+            return Err(Problem { detail, ..trimmed(batch.floor, state.revision()) });
         }
-        let commit = batch
-            .commits
-            .into_iter()
-            .next()
-            .filter(|commit| commit.revision == revision);
+        let commit = batch.commits.into_iter().next().filter(|commit| commit.revision == revision);
         let commit = commit.ok_or_else(missing)?;
         let mut items = Vec::with_capacity(commit.changes.len());
         let mut unchanged_since = BTreeMap::new();
@@ -429,7 +410,9 @@ impl ConfigService {
             }
             let before = match change.previous {
                 None => None,
-                Some(previous) => Some(self.seen_version(caller, &state, &key, previous).await?.change.document),
+                Some(previous) => {
+                    Some(self.seen_version(caller, &state, &key, previous).await?.change.document)
+                }
             };
             if !force {
                 let now = if change.op == Op::Delete { 0 } else { revision };
@@ -452,8 +435,7 @@ impl ConfigService {
         name: &DocumentName,
         idempotency: Option<Idempotency>,
     ) -> Result<Answer<Written>, Problem> {
-        self.end_rollout(caller, name, "rollout_promote", Content::Promote, idempotency)
-            .await
+        self.end_rollout(caller, name, "rollout_promote", Content::Promote, idempotency).await
     }
 
     /// Ends a roll-out without effect.
@@ -468,8 +450,7 @@ impl ConfigService {
         idempotency: Option<Idempotency>,
     ) -> Result<Answer<Written>, Problem> {
         let content = Content::Abort(reason.chars().take(1000).collect());
-        self.end_rollout(caller, name, "rollout_abort", content, idempotency)
-            .await
+        self.end_rollout(caller, name, "rollout_abort", content, idempotency).await
     }
 
     async fn end_rollout(
@@ -484,11 +465,11 @@ impl ConfigService {
         let key = Key::rollout(name.clone());
         self.check_view_of_existing(caller, &key).await?;
         let item = item(key, content, Precondition::None);
-        self.write_one(request(caller, action, Form::Single, vec![item]), idempotency, 0)
-            .await
+        self.write_one(request(caller, action, Form::Single, vec![item]), idempotency, 0).await
     }
 
-    /// Removes commits before a revision. Gives the smallest revision that a watch may start after from now on.
+    /// Removes commits before a revision. Gives the smallest revision that a watch may start after
+    /// from now on.
     ///
     /// # Errors
     /// [`Problem`].
@@ -516,32 +497,24 @@ impl ConfigService {
         let floor = self.inner.store.trim(before - 1, self.inner.keep_versions).await;
         let floor = floor.map_err(|error| outcome_unknown(&error))?;
         self.inner.log.raise_floor(floor);
-        Ok(Answer {
-            revision: state.revision(),
-            replayed: false,
-            value: floor,
-        })
+        Ok(Answer { revision: state.revision(), replayed: false, value: floor })
     }
 }
 
 /// A write that changed nothing reflects the revision of what is there.
 fn own_revision(done: &Done) -> u64 {
     match done.evaluated.changes.is_empty() {
-        true => done
-            .written()
-            .map_or(done.revision, |written| written.document.revision),
+        true => done.written().map_or(done.revision, |written| written.document.revision),
         false => done.revision,
     }
 }
 
 fn once(caller: &Caller, idempotency: &Idempotency) -> Once {
-    // What a token sees is part of who asks: the answer that one got is not for another of the same subject. Its roles are
-    // not: every token that comes here may write, and a renewed one may name them otherwise.
+    // What a token sees is part of who asks: the answer that one got is not for another of the same
+    // subject. Its roles are not: every token that comes here may write, and a renewed one may name
+    // them otherwise.
     let claims = &caller.claims;
     let layer = claims.layer.as_ref().map(LayerName::as_str);
     let text = json!([claims.subject, layer, idempotency.path, idempotency.key]).to_string();
-    Once {
-        id: hex(&Sha256::digest(text.as_bytes())),
-        body: hex(&idempotency.body),
-    }
+    Once { id: hex(&Sha256::digest(text.as_bytes())), body: hex(&idempotency.body) }
 }

@@ -20,13 +20,12 @@ async fn tried() -> (World, String) {
     }
     let spec = json!({
         "target": { "kind": "Service", "name": "s" }, "patch": { "config": { "n": 2 } },
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        "canary": { "node_selector": "canary=true" }, "gate": {
+            "window_s": 60,
+            "max_unhealthy": 0,
+        },
     });
-    let started = w
-        .service
-        .create(&w.admin, input("Rollout/r", spec), None)
-        .await
-        .unwrap();
+    let started = w.service.create(&w.admin, input("Rollout/r", spec), None).await.unwrap();
     let uid = started.value.document.uid.clone();
     (w, uid)
 }
@@ -53,18 +52,14 @@ impl World {
             digest: String::new(),
             without_texts: false,
         };
-        let opened = self
-            .service
-            .sync(&caller(&["worker"], Some(layer)), hello, true)
-            .await
-            .unwrap();
+        let opened =
+            self.service.sync(&caller(&["worker"], Some(layer)), hello, true).await.unwrap();
         opened.into_parts().1
     }
 
     fn says(&self, session: &WorkerSession, reports: Vec<RolloutReport>) {
         let revision = self.service.revision();
-        self.service
-            .acknowledged(session, Acknowledged::new(revision, String::new(), [], reports));
+        self.service.acknowledged(session, Acknowledged::new(revision, String::new(), [], reports));
     }
 
     async fn status_of_r(&self) -> Value {
@@ -81,9 +76,7 @@ impl World {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
         };
-        tokio::time::timeout(Duration::from_secs(10), wait)
-            .await
-            .expect("it ends within 10 s")
+        tokio::time::timeout(Duration::from_secs(10), wait).await.expect("it ends within 10 s")
     }
 }
 
@@ -108,17 +101,10 @@ async fn what_workers_report_is_shown_and_is_no_commit() {
         (&canaries[1]["phase"], &canaries[2]["phase"]),
         (&json!("pending"), &json!("pending"))
     );
-    let query = ListQuery {
-        kind: Some(blaze_domain::config::Kind::Rollout),
-        ..ListQuery::default()
-    };
-    let listed = w
-        .service
-        .list(&w.admin, &query, &ReadOptions::default())
-        .await
-        .unwrap()
-        .value
-        .items;
+    let query =
+        ListQuery { kind: Some(blaze_domain::config::Kind::Rollout), ..ListQuery::default() };
+    let listed =
+        w.service.list(&w.admin, &query, &ReadOptions::default()).await.unwrap().value.items;
     assert_eq!(listed[0].status.as_ref().unwrap()["canaries"][0], line);
     assert_eq!(w.service.revision(), before);
     // A node that has become a canary since.
@@ -149,7 +135,12 @@ async fn a_failure_on_one_canary_ends_the_roll_out_in_one_commit_and_everywhere(
         (&status["phase"], &status["reason"]),
         (&json!("failed"), &json!("robot-1: s/0 rejected it"))
     );
-    let line = json!({ "node": "robot-1", "phase": "failed", "revision": before, "reason": "s/0 rejected it" });
+    let line = json!({
+        "node": "robot-1",
+        "phase": "failed",
+        "revision": before,
+        "reason": "s/0 rejected it",
+    });
     assert_eq!(status["canaries"][0], line);
     assert_eq!(w.get("Rollout/r").await.unwrap().updated_by, "worker:edge/robot-1");
     assert_eq!(w.effective(on("server")).await.config["n"], 1);
@@ -168,10 +159,7 @@ async fn a_worker_ends_nothing_that_is_not_tried_in_its_layer() {
     let (w, uid) = tried().await;
     let before = w.service.revision();
     let session = w.session("edge", "robot-1").await;
-    let nobody = RolloutReport {
-        node: None,
-        ..report(&uid, "robot-1", "failed", "")
-    };
+    let nobody = RolloutReport { node: None, ..report(&uid, "robot-1", "failed", "") };
     let reports = [
         report(&uid, "server", "failed", "of another layer"),
         report(&uid, "nowhere", "failed", ""),
@@ -180,10 +168,6 @@ async fn a_worker_ends_nothing_that_is_not_tried_in_its_layer() {
     ];
     w.says(&session, reports.to_vec());
     w.put("Layer/fog", json!({ "kind": "fog", "config": { "a": 1 } })).await;
-    assert_eq!(
-        w.service.revision(),
-        before + 1,
-        "the committer takes one after the other"
-    );
+    assert_eq!(w.service.revision(), before + 1, "the committer takes one after the other");
     assert_eq!(w.status_of_r().await["phase"], "canary");
 }

@@ -3,11 +3,7 @@
 use super::*;
 
 fn once(body: u8) -> Option<Idempotency> {
-    Some(Idempotency {
-        key: "k".to_owned(),
-        path: "/api/v1/layers".to_owned(),
-        body: [body; 32],
-    })
+    Some(Idempotency { key: "k".to_owned(), path: "/api/v1/layers".to_owned(), body: [body; 32] })
 }
 
 #[tokio::test]
@@ -28,15 +24,15 @@ async fn the_same_request_twice_is_done_once() {
 #[tokio::test]
 async fn a_request_whose_caller_left_is_not_done_again() {
     let w = world().await;
-    let create = || {
-        w.service
-            .create(&w.admin, input("Layer/edge", json!({ "kind": "edge" })), once(1))
-    };
+    let create =
+        || w.service.create(&w.admin, input("Layer/edge", json!({ "kind": "edge" })), once(1));
     // Asked once, it stands in the queue; then whoever asked is gone.
     assert!(create().now_or_never().is_none());
     loop {
         match create().await {
-            Err(problem) if problem.code == Code::IdempotencyInProgress => tokio::task::yield_now().await,
+            Err(problem) if problem.code == Code::IdempotencyInProgress => {
+                tokio::task::yield_now().await
+            }
             again => {
                 assert!(again.unwrap().replayed);
                 break;
@@ -55,10 +51,7 @@ async fn an_answer_that_another_process_gave_is_told_when_it_can_be_read_here() 
     let first = one.service.create(&one.admin, layer(), once(1)).await.unwrap();
     let again = other.service.create(&other.admin, layer(), once(1)).await.unwrap();
     assert_eq!((again.replayed, again.revision), (true, first.revision));
-    let cached = ReadOptions {
-        cached: true,
-        ..ReadOptions::default()
-    };
+    let cached = ReadOptions { cached: true, ..ReadOptions::default() };
     let read = other.service.get(&other.admin, &key("Layer/edge"), &cached).await;
     assert_eq!(read.unwrap().revision, first.revision);
 }

@@ -31,11 +31,7 @@ async fn pages_show_one_revision() {
                 false,
             )
             .await
-            .unwrap_or(Answer {
-                revision: 0,
-                replayed: false,
-                value: (),
-            });
+            .unwrap_or(Answer { revision: 0, replayed: false, value: () });
     }
     assert_eq!(names, ["l0", "l1", "l2", "l3", "l4"]);
     query.limit = Some(0);
@@ -54,18 +50,10 @@ async fn a_page_of_large_documents_is_shorter() {
         let spec = json!({ "config": { "text": text, "number": number } });
         w.put(&format!("Service/s{number:02}"), spec).await;
     }
-    let mut query = ListQuery {
-        limit: Some(1000),
-        ..ListQuery::default()
-    };
+    let mut query = ListQuery { limit: Some(1000), ..ListQuery::default() };
     let mut pages = Vec::new();
     loop {
-        let page = w
-            .service
-            .list(&w.admin, &query, &ReadOptions::default())
-            .await
-            .unwrap()
-            .value;
+        let page = w.service.list(&w.admin, &query, &ReadOptions::default()).await.unwrap().value;
         pages.push(page.items.len());
         query.page_token = page.next_page_token;
         if query.page_token.is_empty() {
@@ -75,8 +63,7 @@ async fn a_page_of_large_documents_is_shorter() {
     assert_eq!((pages.len(), pages.iter().sum::<usize>()), (2, documents), "{pages:?}");
 
     for number in 1..versions {
-        w.put("Service/s00", json!({ "config": { "text": text, "number": number } }))
-            .await;
+        w.put("Service/s00", json!({ "config": { "text": text, "number": number } })).await;
     }
     let of = async |full, limit, token: &str| {
         let (key, read) = (key("Service/s00"), ReadOptions::default());
@@ -86,12 +73,8 @@ async fn a_page_of_large_documents_is_shorter() {
     assert_eq!(of(false, 1000, "").await.items.len(), versions);
     let first = of(true, 1000, "").await;
     let second = of(true, 1000, &first.next_page_token).await;
-    let seen: Vec<u64> = first
-        .items
-        .iter()
-        .chain(&second.items)
-        .map(|entry| entry.revision)
-        .collect();
+    let seen: Vec<u64> =
+        first.items.iter().chain(&second.items).map(|entry| entry.revision).collect();
     assert_eq!((seen.len(), second.next_page_token.as_str()), (versions, ""));
     assert!(seen.is_sorted_by(|a, b| a > b) && first.items.len() < versions);
     assert_eq!(of(true, 3, "").await.items.len(), 3);

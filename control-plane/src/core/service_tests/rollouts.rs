@@ -5,7 +5,10 @@ use super::*;
 fn on(kind: &str, name: &str, patch: &Value) -> Value {
     json!({
         "target": { "kind": kind, "name": name }, "patch": patch,
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        "canary": { "node_selector": "canary=true" }, "gate": {
+            "window_s": 60,
+            "max_unhealthy": 0,
+        },
     })
 }
 
@@ -34,9 +37,7 @@ async fn start(w: &World, by: &Caller, name: &str, spec: Value) -> Result<Writte
 async fn a_roll_out_is_checked_where_it_is_tried() {
     let w = canary_world().await;
     let schema = json!({ "properties": { "n": { "type": "integer" } } });
-    w.patch("Service/s", json!({ "spec": { "schema": schema } }))
-        .await
-        .unwrap();
+    w.patch("Service/s", json!({ "spec": { "schema": schema } })).await.unwrap();
     for (kind, name, patch) in [
         ("Service", "s", json!({ "config": { "n": "text" } })),
         ("Layer", "edge", json!({ "config": { "n": "text" } })),
@@ -50,15 +51,14 @@ async fn a_roll_out_is_checked_where_it_is_tried() {
     let report = w.apply(items).await.unwrap();
     let nodes: Vec<_> = report.affected.iter().filter_map(|place| place.node.as_ref()).collect();
     assert_eq!(nodes.len(), 1, "{report:?}");
-    w.patch("Node/robot-1", json!({ "labels": { "x": "y" } }))
-        .await
-        .unwrap();
+    w.patch("Node/robot-1", json!({ "labels": { "x": "y" } })).await.unwrap();
 }
 
 #[tokio::test]
 async fn what_a_roll_out_makes_of_its_target_must_be_allowed() {
     let w = canary_world().await;
-    let refused = start(&w, &w.admin, "r", on("Node", "robot-1", &json!({ "layer": "nowhere" }))).await;
+    let refused =
+        start(&w, &w.admin, "r", on("Node", "robot-1", &json!({ "layer": "nowhere" }))).await;
     let problem = refused.unwrap_err();
     assert_eq!(problem.code, Code::ReferenceNotFound);
     assert_eq!(problem.errors[0].pointer, "/spec/patch/layer");
@@ -72,17 +72,11 @@ async fn what_a_roll_out_makes_of_its_target_must_be_allowed() {
     let half = |letter: &str| letter.repeat(140 * 1024);
     w.put("Service/s", json!({ "config": { "a": half("a") } })).await;
     let large = on("Service", "s", &json!({ "config": { "b": half("b") } }));
-    assert_eq!(
-        code(start(&w, &w.admin, "large", large.clone()).await),
-        Code::PayloadTooLarge
-    );
+    assert_eq!(code(start(&w, &w.admin, "large", large.clone()).await), Code::PayloadTooLarge);
     w.put("Service/s", json!({})).await;
     start(&w, &w.admin, "large", large).await.unwrap();
     w.put("Service/s", json!({ "config": { "a": half("a") } })).await;
-    let promoted = w
-        .service
-        .promote_rollout(&w.admin, &"large".parse().unwrap(), None)
-        .await;
+    let promoted = w.service.promote_rollout(&w.admin, &"large".parse().unwrap(), None).await;
     assert_eq!(code(promoted), Code::PayloadTooLarge);
 }
 
@@ -93,10 +87,7 @@ async fn one_roll_out_at_a_time_until_it_has_ended() {
     start(&w, &w.admin, "first", spec()).await.unwrap();
     let problem = start(&w, &w.admin, "second", spec()).await.unwrap_err();
     let first = w.get("Rollout/first").await.unwrap();
-    assert_eq!(
-        (problem.code, problem.revision),
-        (Code::RolloutActive, Some(first.revision))
-    );
+    assert_eq!((problem.code, problem.revision), (Code::RolloutActive, Some(first.revision)));
     let name = "first".parse().unwrap();
     w.service.abort_rollout(&w.admin, &name, "enough", None).await.unwrap();
     start(&w, &w.admin, "second", spec()).await.unwrap();
@@ -123,29 +114,17 @@ async fn a_promotion_can_be_reverted_and_the_roll_out_stays_as_it_is() {
     w.service.revert(&w.admin, started, true, None).await.unwrap();
     assert_eq!(code(w.get("Rollout/r").await), Code::NotFound);
     // A commit that changed nothing but a roll-out has nothing to give back.
-    start(&w, &w.admin, "q", on("Service", "s", &json!({ "config": { "n": 3 } })))
-        .await
-        .unwrap();
+    start(&w, &w.admin, "q", on("Service", "s", &json!({ "config": { "n": 3 } }))).await.unwrap();
     let name = "q".parse().unwrap();
-    let aborted = w
-        .service
-        .abort_rollout(&w.admin, &name, "", None)
-        .await
-        .unwrap()
-        .revision;
-    assert_eq!(
-        code(w.service.revert(&w.admin, aborted, false, None).await),
-        Code::RolloutState
-    );
+    let aborted = w.service.abort_rollout(&w.admin, &name, "", None).await.unwrap().revision;
+    assert_eq!(code(w.service.revert(&w.admin, aborted, false, None).await), Code::RolloutState);
 }
 
 #[tokio::test]
 async fn a_schema_that_is_tried_is_checked_on_the_canaries() {
     let w = canary_world().await;
     let tries = |schema: Value| on("Service", "s", &json!({ "schema": schema }));
-    let broken = start(&w, &w.admin, "r", tries(json!({ "type": "objekt" })))
-        .await
-        .unwrap_err();
+    let broken = start(&w, &w.admin, "r", tries(json!({ "type": "objekt" }))).await.unwrap_err();
     assert_eq!(
         (broken.code, broken.errors[0].pointer.as_str()),
         (Code::ValidationFailed, "/spec/patch/schema")
@@ -155,12 +134,9 @@ async fn a_schema_that_is_tried_is_checked_on_the_canaries() {
     let right = json!({ "properties": { "n": { "maximum": 5 } } });
     start(&w, &w.admin, "r", tries(right)).await.unwrap();
     // Where it is tried it holds, and elsewhere not yet.
-    let refused = w
-        .patch("Node/robot-1", json!({ "spec": { "config": { "n": 6 } } }))
-        .await;
+    let refused = w.patch("Node/robot-1", json!({ "spec": { "config": { "n": 6 } } })).await;
     assert_eq!(code(refused), Code::SchemaMismatch);
-    w.put("Node/robot-2", json!({ "layer": "edge", "config": { "n": 6 } }))
-        .await;
+    w.put("Node/robot-2", json!({ "layer": "edge", "config": { "n": 6 } })).await;
     let promoted = w.service.promote_rollout(&w.admin, &"r".parse().unwrap(), None).await;
     assert_eq!(code(promoted), Code::SchemaMismatch);
 }
@@ -173,17 +149,10 @@ async fn a_roll_out_is_judged_by_what_the_whole_request_makes() {
         if canary {
             input.labels.insert("canary".to_owned(), "true".to_owned());
         }
-        ApplyItem {
-            input,
-            revision: None,
-            delete: false,
-        }
+        ApplyItem { input, revision: None, delete: false }
     };
     let apply = async |items: Vec<ApplyItem>| {
-        let request = ApplyRequest {
-            items,
-            ..ApplyRequest::default()
-        };
+        let request = ApplyRequest { items, ..ApplyRequest::default() };
         w.service.apply(&w.admin, request, None).await
     };
     let rollout = || on("Service", "s", &json!({ "config": { "n": 2 } }));
@@ -199,10 +168,7 @@ async fn a_roll_out_is_judged_by_what_the_whole_request_makes() {
     apply(all).await.unwrap();
     let status = w.get("Rollout/r").await.unwrap().status.clone().unwrap();
     assert_eq!(status["canaries"][0]["node"], "robot-1");
-    w.service
-        .abort_rollout(&w.admin, &"r".parse().unwrap(), "", None)
-        .await
-        .unwrap();
+    w.service.abort_rollout(&w.admin, &"r".parse().unwrap(), "", None).await.unwrap();
     // A node that is none afterwards.
     let without = vec![item("Rollout/q", rollout(), false), item("Node/robot-1", node(), false)];
     let problem = apply(without).await.unwrap_err();
@@ -260,7 +226,10 @@ async fn a_roll_out_counts_on_its_canaries_until_it_is_promoted() {
     let spec = json!({
         "target": { "kind": "Service", "name": "slam" },
         "patch": { "config": { "camera": { "rate_hz": 5 } } },
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        "canary": { "node_selector": "canary=true" }, "gate": {
+            "window_s": 60,
+            "max_unhealthy": 0,
+        },
     });
     let started = w
         .service
@@ -304,7 +273,10 @@ async fn a_change_is_tried_only_where_its_target_counts() {
     let spec = |kind: &str, name: &str| {
         json!({
             "target": { "kind": kind, "name": name }, "patch": { "config": { "a": 5 } },
-            "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+            "canary": { "node_selector": "canary=true" }, "gate": {
+                "window_s": 60,
+                "max_unhealthy": 0,
+            },
         })
     };
     for (kind, name, expected) in [
@@ -315,16 +287,12 @@ async fn a_change_is_tried_only_where_its_target_counts() {
     ] {
         let rollout = input(&format!("Rollout/to-{name}"), spec(kind, name));
         let started = w.service.create(&w.admin, rollout, None).await.unwrap().value;
-        let canaries = started.document.status.as_ref().unwrap()["canaries"]
-            .as_array()
-            .unwrap()
-            .clone();
-        let names: Vec<&str> = canaries.iter().map(|canary| canary["node"].as_str().unwrap()).collect();
+        let canaries =
+            started.document.status.as_ref().unwrap()["canaries"].as_array().unwrap().clone();
+        let names: Vec<&str> =
+            canaries.iter().map(|canary| canary["node"].as_str().unwrap()).collect();
         assert_eq!(names, expected, "{kind} {name}");
     }
     let nowhere = input("Rollout/nowhere", spec("Node", "robot-1"));
-    assert_eq!(
-        code(w.service.create(&w.admin, nowhere, None).await),
-        Code::ValidationFailed
-    );
+    assert_eq!(code(w.service.create(&w.admin, nowhere, None).await), Code::ValidationFailed);
 }

@@ -87,8 +87,8 @@ async fn items_that_look_the_same_are_told_apart_only_where_that_is_certain() {
     assert_eq!(after(&same, |list| drop(list.remove(0))).await.unwrap(), ["A"]);
     // A list within a list, and secrets that are items themselves.
     let w = world().await;
-    let nested =
-        json!({ "config": { "outer": [{ "n": 1, "in": [{ "$secret": "A" }, { "$secret": "B" }] }, { "n": 2 }] } });
+    let nested = json!({ "config": { "outer": [{ "n": 1, "in": [{ "$secret": "A" }, { "$secret": "B" }] },
+        { "n": 2 }] } });
     w.put("Service/s", nested).await;
     let mut spec = (*w.get("Service/s").await.unwrap().spec).clone();
     spec["config"]["outer"].as_array_mut().unwrap().remove(1);
@@ -98,7 +98,8 @@ async fn items_that_look_the_same_are_told_apart_only_where_that_is_certain() {
 
 #[tokio::test]
 async fn an_edited_item_keeps_its_own_secret_and_never_that_of_another() {
-    // Told by the version of the secret: what was edited has moved to the place of one that is gone.
+    // Told by the version of the secret: what was edited has moved to the place of one that is
+    // gone.
     let w = three().await;
     after(&w, |list| list[1] = user("b", "newer")).await.unwrap();
     let moved = |list: &mut Vec<Value>| {
@@ -147,8 +148,7 @@ async fn an_edited_item_keeps_its_own_secret_and_never_that_of_another() {
 #[tokio::test]
 async fn a_schema_learns_nothing_of_a_secret() {
     let w = world().await;
-    w.put("Service/s", json!({ "config": { "pw": { "$secret": "BOB" } } }))
-        .await;
+    w.put("Service/s", json!({ "config": { "pw": { "$secret": "BOB" } } })).await;
     let with = async |schema: Value| {
         let patch = json!({ "spec": { "schema": { "properties": { "pw": schema } } } });
         w.patch("Service/s", patch).await

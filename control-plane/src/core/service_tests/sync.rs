@@ -6,7 +6,9 @@ use blaze_domain::config::{canonical, secret};
 use futures::stream::BoxStream;
 
 use super::*;
-use crate::core::{Acknowledged, Running, RunningState, SYNC_PROTOCOL, SyncHello, SyncItem, WorkerSession};
+use crate::core::{
+    Acknowledged, Running, RunningState, SYNC_PROTOCOL, SyncHello, SyncItem, WorkerSession,
+};
 
 /// A worker that believes all it is told.
 struct Copy {
@@ -85,9 +87,7 @@ impl Copy {
                 }
             }
         };
-        tokio::time::timeout(Duration::from_secs(20), wait)
-            .await
-            .expect("it comes within 20 s")
+        tokio::time::timeout(Duration::from_secs(20), wait).await.expect("it comes within 20 s")
     }
 
     fn take(&mut self, item: SyncItem) {
@@ -137,26 +137,17 @@ async fn a_new_worker_gets_what_its_layer_sees_and_then_every_change_of_it() {
     let mut fog = w.worker(hello("fog", 0, "")).await;
     assert!(!edge.resumed);
     edge.until(3).await;
-    assert_eq!(
-        edge.names(),
-        ["Layer/edge", "Node/robot-1", "Service/slam", "Instance/slam/0"]
-    );
+    assert_eq!(edge.names(), ["Layer/edge", "Node/robot-1", "Service/slam", "Instance/slam/0"]);
     fog.until(3).await;
     assert_eq!(fog.names(), ["Layer/fog", "Service/fog-only", "Service/slam"]);
 
     // What moves to another layer takes along what is placed on it.
-    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } }))
-        .await
-        .unwrap();
+    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } })).await.unwrap();
     edge.until(4).await;
     fog.until(4).await;
     assert_eq!(edge.names(), ["Layer/edge", "Service/slam"]);
-    let moved = |op| {
-        vec![
-            (4, op, "Node/robot-1".to_owned()),
-            (4, op, "Instance/slam/0".to_owned()),
-        ]
-    };
+    let moved =
+        |op| vec![(4, op, "Node/robot-1".to_owned()), (4, op, "Instance/slam/0".to_owned())];
     assert_eq!((edge.told, fog.told.clone()), (moved("leave"), moved("update")));
     assert_eq!(fog.digest(), w.digest("fog").await["digest"]);
 }
@@ -167,8 +158,7 @@ async fn a_worker_that_was_away_gets_what_it_has_missed() {
     w.robot().await;
     let store_id = w.service.store_id().to_owned();
     w.put("Layer/fog", json!({ "kind": "fog" })).await;
-    w.put("Layer/edge", json!({ "kind": "edge", "config": { "a": 2 } }))
-        .await;
+    w.put("Layer/edge", json!({ "kind": "edge", "config": { "a": 2 } })).await;
     let mut back = w.worker(hello("edge", 1, &store_id)).await;
     assert!(back.resumed);
     assert_eq!(back.revision, 3, "so it knows when it has all");
@@ -188,10 +178,7 @@ async fn a_worker_that_was_away_gets_what_it_has_missed() {
         (1, store_id.as_str(), "sha256:0".to_owned(), "it has something else"),
         (0, store_id.as_str(), String::new(), "it has nothing"),
     ] {
-        let asks = SyncHello {
-            digest,
-            ..hello("edge", revision, store)
-        };
+        let asks = SyncHello { digest, ..hello("edge", revision, store) };
         let mut anew = w.worker(asks).await;
         assert!(!anew.resumed, "{why}");
         anew.until(3).await;
@@ -209,36 +196,20 @@ async fn a_worker_that_was_away_gets_what_it_has_missed() {
 #[tokio::test]
 async fn secrets_go_in_clear_over_a_safe_connection_alone() {
     let w = world().await;
-    w.put(
-        "Service/slam",
-        json!({ "config": { "password": { "$secret": "canary" } } }),
-    )
-    .await;
+    w.put("Service/slam", json!({ "config": { "password": { "$secret": "canary" } } })).await;
     for (is_safe, shown) in [
         (true, json!({ "$secret": { "text": "canary", "version": 1 } })),
         (false, json!({ "$secret": { "redacted": true, "version": 1 } })),
     ] {
         let mut worker = w.worker_over(hello("edge", 0, ""), is_safe).await;
         worker.until(1).await;
-        assert_eq!(
-            worker.documents[&key("Service/slam")].config().unwrap()["password"],
-            shown
-        );
+        assert_eq!(worker.documents[&key("Service/slam")].config().unwrap()["password"], shown);
     }
-    let mut blind = w
-        .worker(SyncHello {
-            without_texts: true,
-            ..hello("edge", 0, "")
-        })
-        .await;
+    let mut blind = w.worker(SyncHello { without_texts: true, ..hello("edge", 0, "") }).await;
     blind.until(1).await;
     let mut live = w.worker(hello("edge", 0, "")).await;
     live.until(1).await;
-    w.put(
-        "Service/slam",
-        json!({ "config": { "password": { "$secret": "second" } } }),
-    )
-    .await;
+    w.put("Service/slam", json!({ "config": { "password": { "$secret": "second" } } })).await;
     live.until(2).await;
     let document = &live.documents[&key("Service/slam")];
     assert_eq!(document.config().unwrap()["password"]["$secret"]["text"], "second");
@@ -268,21 +239,9 @@ async fn only_the_worker_of_a_layer_is_told_of_it() {
         let code = refused.map(drop).unwrap_err().code;
         assert_eq!(code, Code::PermissionDenied, "{roles:?} of {layer}");
     }
-    let nameless = SyncHello {
-        worker_id: String::new(),
-        ..hello("edge", 0, "")
-    };
-    for senseless in [
-        SyncHello {
-            protocol: 0,
-            ..hello("edge", 0, "")
-        },
-        nameless,
-    ] {
-        let refused = w
-            .service
-            .sync(&caller(&["worker"], Some("edge")), senseless, true)
-            .await;
+    let nameless = SyncHello { worker_id: String::new(), ..hello("edge", 0, "") };
+    for senseless in [SyncHello { protocol: 0, ..hello("edge", 0, "") }, nameless] {
+        let refused = w.service.sync(&caller(&["worker"], Some("edge")), senseless, true).await;
         assert_eq!(refused.map(drop).unwrap_err().code, Code::InvalidRequest);
     }
 }
@@ -294,9 +253,7 @@ async fn a_slow_worker_misses_nothing() {
     let mut worker = w.worker(hello("edge", 0, "")).await;
     worker.until(1).await;
     for number in 0..1100 {
-        w.patch("Node/robot-1", json!({ "spec": { "config": { "n": number } } }))
-            .await
-            .unwrap();
+        w.patch("Node/robot-1", json!({ "spec": { "config": { "n": number } } })).await.unwrap();
     }
     // More than a watcher may be behind.
     worker.until(1101).await;
@@ -329,10 +286,7 @@ async fn what_a_worker_has_is_known_while_it_is_here_and_after() {
     let digest = worker.until(1).await;
     let listed = |answer: Answer<Value>| answer.value["items"][0].clone();
     let before = listed(w.service.workers(&w.admin, &read).await.unwrap());
-    assert_eq!(
-        (&before["connected"], &before["in_sync"]),
-        (&json!(true), &json!(false))
-    );
+    assert_eq!((&before["connected"], &before["in_sync"]), (&json!(true), &json!(false)));
 
     let running = Running {
         service: "slam".parse().unwrap(),
@@ -352,21 +306,16 @@ async fn what_a_worker_has_is_known_while_it_is_here_and_after() {
     let topology = w.service.topology(&w.admin, &read).await.unwrap().value;
     let node = &topology["layers"][0]["nodes"][0];
     assert_eq!(node["worker"]["in_sync"], true);
-    let slam = json!({ "service": "slam", "instance": "0", "state": "ready", "config_revision": 1 });
+    let slam =
+        json!({ "service": "slam", "instance": "0", "state": "ready", "config_revision": 1 });
     assert_eq!(node["services"], json!([slam]));
 
     // What it has is old now, and nobody of another layer is told of it.
     w.put("Layer/edge", json!({ "kind": "edge" })).await;
-    assert_eq!(
-        listed(w.service.workers(&w.admin, &read).await.unwrap())["in_sync"],
-        false
-    );
+    assert_eq!(listed(w.service.workers(&w.admin, &read).await.unwrap())["in_sync"], false);
     assert_eq!(w.service.worker_lags().into_values().collect::<Vec<_>>(), [1]);
     let other = caller(&["viewer"], Some("fog"));
-    assert_eq!(
-        w.service.workers(&other, &read).await.unwrap().value["items"],
-        json!([])
-    );
+    assert_eq!(w.service.workers(&other, &read).await.unwrap().value["items"], json!([]));
     drop(worker);
     let gone = listed(w.service.workers(&w.admin, &read).await.unwrap());
     assert_eq!((&gone["connected"], &gone["in_sync"]), (&json!(false), &json!(false)));
@@ -381,9 +330,8 @@ async fn a_worker_is_told_to_come_again_when_the_service_ends() {
     worker.until(1).await;
     w.service.end_watches();
     let mut rest = Vec::new();
-    while let Some(item) = tokio::time::timeout(Duration::from_secs(10), worker.items.next())
-        .await
-        .unwrap()
+    while let Some(item) =
+        tokio::time::timeout(Duration::from_secs(10), worker.items.next()).await.unwrap()
     {
         rest.push(item);
     }

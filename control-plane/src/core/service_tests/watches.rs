@@ -19,9 +19,7 @@ async fn next(stream: &mut crate::core::WatchStream) -> (u64, Vec<(&'static str,
             }
         }
     };
-    tokio::time::timeout(Duration::from_secs(10), wait)
-        .await
-        .expect("a commit within 10 s")
+    tokio::time::timeout(Duration::from_secs(10), wait).await.expect("a commit within 10 s")
 }
 
 #[tokio::test]
@@ -29,10 +27,7 @@ async fn a_watch_tells_every_commit_from_a_revision_on() {
     let w = world().await;
     w.robot().await;
     w.put("Layer/fog", json!({ "kind": "fog" })).await;
-    let query = WatchQuery {
-        since: Some(0),
-        ..WatchQuery::default()
-    };
+    let query = WatchQuery { since: Some(0), ..WatchQuery::default() };
     let mut stream = w.service.watch(&w.admin, &query).await.unwrap().value;
     let (revision, changes) = next(&mut stream).await;
     assert_eq!((revision, changes.len()), (1, 4));
@@ -53,10 +48,10 @@ async fn what_leaves_a_filter_is_told_also_when_it_moves_with_its_node() {
     };
     let mut edge = w.service.watch(&w.admin, &query("edge")).await.unwrap().value;
     let mut fog = w.service.watch(&w.admin, &query("fog")).await.unwrap().value;
-    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } }))
-        .await
-        .unwrap();
-    let both = |op: &'static str| vec![(op, "Node/robot-1".to_owned()), (op, "Instance/slam/0".to_owned())];
+    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } })).await.unwrap();
+    let both = |op: &'static str| {
+        vec![(op, "Node/robot-1".to_owned()), (op, "Instance/slam/0".to_owned())]
+    };
     assert_eq!(next(&mut edge).await, (3, both("leave")));
     assert_eq!(next(&mut fog).await, (3, both("update")));
 }
@@ -68,10 +63,7 @@ async fn a_watch_of_what_is_trimmed_is_refused_with_where_to_begin() {
         w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
     }
     assert_eq!(w.service.trim(&w.admin, 4, None).await.unwrap().value, 3);
-    let query = |since| WatchQuery {
-        since: Some(since),
-        ..WatchQuery::default()
-    };
+    let query = |since| WatchQuery { since: Some(since), ..WatchQuery::default() };
     let refused = w.service.watch(&w.admin, &query(2)).await.err().unwrap();
     assert_eq!(
         (refused.code, refused.oldest_revision, refused.revision),
@@ -87,11 +79,7 @@ async fn a_watch_ends_in_time_although_there_is_more_to_tell() {
     for number in 0..5 {
         w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
     }
-    let query = WatchQuery {
-        since: Some(0),
-        timeout_s: Some(1),
-        ..WatchQuery::default()
-    };
+    let query = WatchQuery { since: Some(0), timeout_s: Some(1), ..WatchQuery::default() };
     let mut stream = w.service.watch(&w.admin, &query).await.unwrap().value;
     assert_eq!(next(&mut stream).await.0, 1);
     tokio::time::pause();
@@ -104,11 +92,7 @@ async fn a_watch_ends_in_time_although_there_is_more_to_tell() {
 #[tokio::test]
 async fn a_watch_begins_at_the_revision_that_is_waited_for() {
     let w = world().await;
-    let read = ReadOptions {
-        cached: true,
-        min_revision: Some(2),
-        ..ReadOptions::default()
-    };
+    let read = ReadOptions { cached: true, min_revision: Some(2), ..ReadOptions::default() };
     let query = WatchQuery::default();
     let writes = async {
         for name in ["Layer/a", "Layer/b"] {
@@ -126,30 +110,18 @@ async fn a_bound_token_is_told_of_its_layer_alone() {
     for (name, spec) in [
         ("Layer/fog", json!({ "kind": "fog" })),
         ("Node/server", json!({ "layer": "fog" })),
-        (
-            "Instance/slam/0",
-            json!({ "node": "server", "config": { "of": "fog" } }),
-        ),
-        (
-            "Instance/slam/0",
-            json!({ "node": "server", "config": { "of": "more fog" } }),
-        ),
+        ("Instance/slam/0", json!({ "node": "server", "config": { "of": "fog" } })),
+        ("Instance/slam/0", json!({ "node": "server", "config": { "of": "more fog" } })),
         ("Layer/edge", json!({ "kind": "edge" })),
     ] {
         w.put(name, spec).await;
     }
-    let query = WatchQuery {
-        since: Some(1),
-        ..WatchQuery::default()
-    };
+    let query = WatchQuery { since: Some(1), ..WatchQuery::default() };
     let bound = caller(&["viewer"], Some("edge"));
     let mut stream = w.service.watch(&bound, &query).await.unwrap().value;
     let mut told = Vec::new();
     while told.len() < 2 {
-        match tokio::time::timeout(Duration::from_secs(10), stream.next())
-            .await
-            .unwrap()
-        {
+        match tokio::time::timeout(Duration::from_secs(10), stream.next()).await.unwrap() {
             Some(WatchItem::Commit(commit)) => told.push(commit),
             Some(WatchItem::Bookmark(_)) => {}
             other => panic!("the stream ended: {other:?}"),
@@ -160,19 +132,13 @@ async fn a_bound_token_is_told_of_its_layer_alone() {
     let told: Vec<(u64, &str, String)> = told
         .iter()
         .flat_map(|commit| {
-            commit
-                .changes
-                .iter()
-                .map(|(op, document)| (commit.revision, op, document))
+            commit.changes.iter().map(|(op, document)| (commit.revision, op, document))
         })
         .map(|(revision, op, document)| (revision, op.as_str(), document.key.to_string()))
         .collect();
     assert_eq!(
         told,
-        [
-            (4, "leave", "Instance/slam/0".to_owned()),
-            (6, "update", "Layer/edge".to_owned())
-        ]
+        [(4, "leave", "Instance/slam/0".to_owned()), (6, "update", "Layer/edge".to_owned())]
     );
 }
 
@@ -182,10 +148,7 @@ async fn a_watch_ends_with_its_reason_when_the_service_ends() {
     let mut stream = w.service.watch(&w.admin, &WatchQuery::default()).await.unwrap().value;
     w.service.end_watches();
     let problem = loop {
-        match tokio::time::timeout(Duration::from_secs(10), stream.next())
-            .await
-            .unwrap()
-        {
+        match tokio::time::timeout(Duration::from_secs(10), stream.next()).await.unwrap() {
             Some(WatchItem::End(problem)) => break problem.unwrap(),
             Some(_) => {}
             None => panic!("it ends without a word"),

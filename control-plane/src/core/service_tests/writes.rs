@@ -5,21 +5,12 @@ use super::*;
 #[tokio::test]
 async fn the_same_number_in_another_form_is_no_change() {
     let w = world().await;
-    w.put("Service/s", json!({ "config": { "n": 1, "list": [2.0, { "m": 3 }] } }))
-        .await;
-    let same = w
-        .put(
-            "Service/s",
-            json!({ "config": { "n": 1.0, "list": [2, { "m": 3.0 }] } }),
-        )
-        .await;
+    w.put("Service/s", json!({ "config": { "n": 1, "list": [2.0, { "m": 3 }] } })).await;
+    let same =
+        w.put("Service/s", json!({ "config": { "n": 1.0, "list": [2, { "m": 3.0 }] } })).await;
     assert_eq!(same.revision, 1);
-    let other = w
-        .put(
-            "Service/s",
-            json!({ "config": { "n": 1.5, "list": [2, { "m": 3.0 }] } }),
-        )
-        .await;
+    let other =
+        w.put("Service/s", json!({ "config": { "n": 1.5, "list": [2, { "m": 3.0 }] } })).await;
     assert_eq!(other.revision, 2);
 }
 
@@ -38,13 +29,7 @@ async fn a_patch_cannot_take_a_name_away() {
             (Code::ValidationFailed, pointer)
         );
     }
-    assert_eq!(
-        w.patch("Layer/edge", json!({ "service": null }))
-            .await
-            .unwrap()
-            .revision,
-        1
-    );
+    assert_eq!(w.patch("Layer/edge", json!({ "service": null })).await.unwrap().revision, 1);
 }
 
 #[tokio::test]
@@ -63,10 +48,8 @@ async fn a_refusal_carries_the_revision_of_the_document() {
         (Code::PreconditionFailed, Some(2)),
         "that of the store"
     );
-    let unsaid = w
-        .try_put("Layer/edge", json!({ "kind": "fog" }), Precondition::None)
-        .await
-        .unwrap_err();
+    let unsaid =
+        w.try_put("Layer/edge", json!({ "kind": "fog" }), Precondition::None).await.unwrap_err();
     assert_eq!((unsaid.code, unsaid.revision), (Code::PreconditionRequired, Some(1)));
     // A document that is gone since.
     w.delete("Layer/fog", false).await.unwrap();
@@ -92,17 +75,11 @@ async fn an_idempotency_key_belongs_to_the_subject_whatever_the_order_of_its_rol
     // Another view is another answer.
     assert!(create(&caller(&["operator"], Some("edge"))).await.is_err());
     // The same key at the same time.
-    let other = || {
-        w.service
-            .create(&w.admin, input("Layer/fog", json!({ "kind": "fog" })), once(2))
-    };
+    let other =
+        || w.service.create(&w.admin, input("Layer/fog", json!({ "kind": "fog" })), once(2));
     let second = || {
-        let once = once(2).map(|once| Idempotency {
-            key: "l".to_owned(),
-            ..once
-        });
-        w.service
-            .create(&w.admin, input("Layer/fog", json!({ "kind": "fog" })), once)
+        let once = once(2).map(|once| Idempotency { key: "l".to_owned(), ..once });
+        w.service.create(&w.admin, input("Layer/fog", json!({ "kind": "fog" })), once)
     };
     assert_eq!(code(other().await), Code::IdempotencyKeyReused);
     let (one, two) = futures::join!(second(), second());
@@ -114,10 +91,8 @@ async fn an_idempotency_key_belongs_to_the_subject_whatever_the_order_of_its_rol
 async fn an_answer_names_a_hundred_faults_at_most() {
     let w = world().await;
     let names: Vec<String> = (0..300).map(|number| format!("l{number}")).collect();
-    let refused = w
-        .try_put("Service/s", json!({ "layers": names }), Precondition::None)
-        .await
-        .unwrap_err();
+    let refused =
+        w.try_put("Service/s", json!({ "layers": names }), Precondition::None).await.unwrap_err();
     assert_eq!((refused.code, refused.errors.len()), (Code::ReferenceNotFound, 100));
     let nodes: Vec<String> = (0..300).map(|number| format!("Node/n{number}")).collect();
     let items = nodes.iter().map(|name| (name.as_str(), json!({ "layer": "none" })));
@@ -142,14 +117,10 @@ async fn a_bound_token_does_not_learn_how_many_hidden_documents_refer_to_one() {
     w.put("Layer/fog", json!({ "kind": "fog" })).await;
     w.put("Service/hidden", json!({ "layers": ["fog"] })).await;
     for number in 0..3 {
-        w.put(&format!("Instance/hidden/i{number}"), json!({ "node": "robot-1" }))
-            .await;
+        w.put(&format!("Instance/hidden/i{number}"), json!({ "node": "robot-1" })).await;
     }
     let detail = refused(&bound).await;
-    assert!(
-        detail.contains("Instance/slam/0, documents that the token does not see"),
-        "{detail}"
-    );
+    assert!(detail.contains("Instance/slam/0, documents that the token does not see"), "{detail}");
     assert!(!detail.contains('3'), "{detail}");
     assert!(refused(&w.admin).await.contains("Instance/hidden/i2"));
 }
@@ -159,23 +130,17 @@ async fn a_report_that_is_kept_is_the_one_that_was_given() {
     let w = world().await;
     w.robot().await;
     let once = || {
-        Some(Idempotency {
-            key: "k".to_owned(),
-            path: "/api/v1/apply".to_owned(),
-            body: [1; 32],
-        })
+        Some(Idempotency { key: "k".to_owned(), path: "/api/v1/apply".to_owned(), body: [1; 32] })
     };
     let request = || {
-        let instances = (0..1000).map(|number| (format!("Instance/slam/i{number}"), json!({ "node": "robot-1" })));
+        let instances = (0..1000)
+            .map(|number| (format!("Instance/slam/i{number}"), json!({ "node": "robot-1" })));
         let items = instances.map(|(name, spec)| ApplyItem {
             input: input(&name, spec),
             revision: None,
             delete: false,
         });
-        ApplyRequest {
-            items: items.collect(),
-            ..ApplyRequest::default()
-        }
+        ApplyRequest { items: items.collect(), ..ApplyRequest::default() }
     };
     let first = w.service.apply(&w.admin, request(), once()).await.unwrap();
     let again = w.service.apply(&w.admin, request(), once()).await.unwrap();
@@ -195,17 +160,9 @@ async fn a_report_that_is_kept_is_the_one_that_was_given() {
                 delete: false,
             },
         ];
-        ApplyRequest {
-            items,
-            ..ApplyRequest::default()
-        }
+        ApplyRequest { items, ..ApplyRequest::default() }
     };
-    let key = || {
-        once().map(|once| Idempotency {
-            key: "l".to_owned(),
-            ..once
-        })
-    };
+    let key = || once().map(|once| Idempotency { key: "l".to_owned(), ..once });
     let first = w.service.apply(&w.admin, more(1), key()).await.unwrap().value;
     assert_eq!(first, w.service.apply(&w.admin, more(1), key()).await.unwrap().value);
     assert_eq!(first.affected_total, 1000);
@@ -221,11 +178,7 @@ async fn a_long_list_without_equals_is_checked_at_once() {
     };
     let begun = std::time::Instant::now();
     w.put("Layer/edge", json!({ "kind": "edge" })).await;
-    w.put(
-        "Service/s",
-        json!({ "schema": schema, "config": { "list": list(12_000) } }),
-    )
-    .await;
+    w.put("Service/s", json!({ "schema": schema, "config": { "list": list(12_000) } })).await;
     let twice = json!({ "schema": schema, "config": { "list": list(5) } });
     let refused = w.try_put("Service/s", twice, Precondition::Any).await;
     assert_eq!(code(refused), Code::SchemaMismatch);

@@ -15,7 +15,9 @@ use super::{MongoStore, collect};
 use crate::store::encode::{corrupt, document, signed, unsigned};
 use crate::store::rows::{AuditRow, IdempotencyRow, TokenRow, VersionRow};
 use crate::store::upkeep::now;
-use crate::store::{AUDIT_KEPT_MS, AuditEntry, AuditQuery, IdempotencyRecord, StoreError, TokenRecord, Version};
+use crate::store::{
+    AUDIT_KEPT_MS, AuditEntry, AuditQuery, IdempotencyRecord, StoreError, TokenRecord, Version,
+};
 
 /// Between the time of an entry and that in its id, at most: they are taken one after the other.
 const ID_SLACK_MS: i64 = 3_600_000;
@@ -23,8 +25,8 @@ const ID_SLACK_MS: i64 = 3_600_000;
 const NAMED: usize = 500;
 
 impl MongoStore {
-    /// From the log, and below the floor from what trimming has kept. First the log, then the floor, then what was kept: it is
-    /// kept before the floor rises, and the log is cut after that.
+    /// From the log, and below the floor from what trimming has kept. First the log, then the
+    /// floor, then what was kept: it is kept before the floor rises, and the log is cut after that.
     pub(super) async fn read_versions(
         &self,
         key: &Key,
@@ -41,26 +43,19 @@ impl MongoStore {
             .events
             .find(matching)
             .sort(doc! { "_id": -1 })
-            // One more, for the record in the middle of which it begins may have later changes alone.
+            // One more, for the record in the middle of which it begins may have later changes
+            // alone.
             .limit(limit_of(limit.saturating_add(1)));
         let find = find.projection(only_of(&doc! { "$eq": ["$$doc.key", &key] }));
         let records = collect(find, rows::read_record).await?;
         let floor = signed(self.read_floor().await?);
         let kept = rows::versions_below(&key, below);
-        let kept = self
-            .tables
-            .versions
-            .find(kept)
-            .sort(doc! { "_id": -1 })
-            .limit(limit_of(limit));
+        let kept = self.tables.versions.find(kept).sort(doc! { "_id": -1 }).limit(limit_of(limit));
         let kept = collect(kept, rows::read_version).await?;
         let logged = records.into_iter().flat_map(|record| record.versions);
         let logged = logged.filter(|row| row.revision > floor && row.revision < below);
-        let newest: BTreeMap<Reverse<i64>, VersionRow> = kept
-            .into_iter()
-            .chain(logged)
-            .map(|row| (Reverse(row.revision), row))
-            .collect();
+        let newest: BTreeMap<Reverse<i64>, VersionRow> =
+            kept.into_iter().chain(logged).map(|row| (Reverse(row.revision), row)).collect();
         newest.into_values().take(limit).map(VersionRow::into_version).collect()
     }
 
@@ -80,9 +75,8 @@ impl MongoStore {
         let floor = self.read_floor().await?;
         let mut documents = Vec::new();
         for (text, (_, previous)) in &first {
-            let key: Key = text
-                .parse()
-                .map_err(|error| corrupt(format_args!("a version: {error}")))?;
+            let key: Key =
+                text.parse().map_err(|error| corrupt(format_args!("a version: {error}")))?;
             let found = previous.and_then(|_| before.get(text));
             if previous.is_some() && found.is_none() && revision >= floor {
                 return Err(corrupt(format_args!(
@@ -96,7 +90,11 @@ impl MongoStore {
     }
 
     /// By key, the first change in a range: its revision and the version before it.
-    async fn first_changes(&self, after: i64, until: i64) -> Result<BTreeMap<String, (i64, Option<i64>)>, StoreError> {
+    async fn first_changes(
+        &self,
+        after: i64,
+        until: i64,
+    ) -> Result<BTreeMap<String, (i64, Option<i64>)>, StoreError> {
         let mut first: BTreeMap<String, (i64, Option<i64>)> = BTreeMap::new();
         // There may be many more changes than documents, so they are not collected before.
         let mut note = |key: &str, changed: i64, previous: Option<i64>| {
@@ -111,18 +109,17 @@ impl MongoStore {
                 }
             }
         };
-        let range = doc! { "_id": { "$gt": after - RECORD_COMMITS, "$lte": until }, "last": { "$gt": after } };
+        let range = doc! {
+            "_id": { "$gt": after - RECORD_COMMITS, "$lte": until },
+            "last": { "$gt": after },
+        };
         let fields = doc! { "docs.key": 1, "docs.revision": 1, "docs.previous": 1 };
         let logged = self.tables.events.find(range).projection(fields);
         collect(logged, |found| {
             for change in rows::members(found, "docs") {
                 let change = change?;
                 let previous = rows::integer(change, "previous").ok();
-                note(
-                    &rows::text(change, "key")?,
-                    rows::integer(change, "revision")?,
-                    previous,
-                );
+                note(&rows::text(change, "key")?, rows::integer(change, "revision")?, previous);
             }
             Ok(())
         })
@@ -141,9 +138,13 @@ impl MongoStore {
     }
 
     /// Texts of one version of each document: from the log, or what trimming has kept of it.
-    async fn read_texts(&self, wanted: &BTreeMap<&str, i64>) -> Result<BTreeMap<String, String>, StoreError> {
+    async fn read_texts(
+        &self,
+        wanted: &BTreeMap<&str, i64>,
+    ) -> Result<BTreeMap<String, String>, StoreError> {
         let mut texts = BTreeMap::new();
-        let all: Vec<(&str, i64)> = wanted.iter().map(|(key, revision)| (*key, *revision)).collect();
+        let all: Vec<(&str, i64)> =
+            wanted.iter().map(|(key, revision)| (*key, *revision)).collect();
         // Most commits begin a record; those that do not are looked for one by one.
         for chunk in all.chunks(NAMED) {
             let revisions: Vec<i64> = chunk.iter().map(|(_, revision)| *revision).collect();
@@ -151,7 +152,8 @@ impl MongoStore {
             self.read_logged(matching, wanted, &mut texts).await?;
             self.read_kept(chunk, wanted, &mut texts).await?;
         }
-        let rest: Vec<(&str, i64)> = all.into_iter().filter(|(key, _)| !texts.contains_key(*key)).collect();
+        let rest: Vec<(&str, i64)> =
+            all.into_iter().filter(|(key, _)| !texts.contains_key(*key)).collect();
         for chunk in rest.chunks(NAMED / 5) {
             let around = chunk.iter().map(|(key, revision)| {
                 let near = doc! { "$gt": revision - RECORD_COMMITS, "$lte": revision };
@@ -172,11 +174,7 @@ impl MongoStore {
         texts: &mut BTreeMap<String, String>,
     ) -> Result<(), StoreError> {
         let revisions: BTreeSet<i64> = wanted.values().copied().collect();
-        let find = self
-            .tables
-            .events
-            .find(matching)
-            .projection(doc! { "audit": 0, "answers": 0 });
+        let find = self.tables.events.find(matching).projection(doc! { "audit": 0, "answers": 0 });
         let logged = collect(find, |found| {
             let mut versions = rows::read_record(found)?.versions;
             versions.retain(|row| revisions.contains(&row.revision));
@@ -193,7 +191,8 @@ impl MongoStore {
         texts: &mut BTreeMap<String, String>,
     ) -> Result<(), StoreError> {
         let ids = some.iter().filter(|(key, _)| !texts.contains_key(*key));
-        let ids: Vec<String> = ids.map(|(key, revision)| rows::version_id(key, *revision)).collect();
+        let ids: Vec<String> =
+            ids.map(|(key, revision)| rows::version_id(key, *revision)).collect();
         if !ids.is_empty() {
             let kept = self.tables.versions.find(doc! { "_id": { "$in": ids } });
             keep_wanted(collect(kept, rows::read_version).await?, wanted, texts);
@@ -216,7 +215,9 @@ impl MongoStore {
             let found = limited(QUICK, find).await?;
             // What was trimmed away meanwhile is old.
             let old = match found {
-                Some(record) => time_in(&record, middle)?.is_none_or(|found| found < time.as_millis()),
+                Some(record) => {
+                    time_in(&record, middle)?.is_none_or(|found| found < time.as_millis())
+                }
                 None => true,
             };
             match old {
@@ -248,11 +249,15 @@ impl MongoStore {
         limited(USUAL, insert).await
     }
 
-    pub(super) async fn read_audit(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, StoreError> {
+    pub(super) async fn read_audit(
+        &self,
+        query: &AuditQuery,
+    ) -> Result<Vec<AuditEntry>, StoreError> {
         if query.limit == 0 {
             return Ok(Vec::new());
         }
-        // First the log, then what trimming has moved out of it: nothing is missed, and what is seen twice has one id.
+        // First the log, then what trimming has moved out of it: nothing is missed, and what is
+        // seen twice has one id.
         let mut newest = self.audit_of_the_log(query).await?;
         let find = self
             .tables
@@ -266,8 +271,12 @@ impl MongoStore {
         newest.map(AuditRow::decode).collect()
     }
 
-    /// The newest entries beside commits that a query asks for, by id. Records come by their newest entry, and may overlap.
-    async fn audit_of_the_log(&self, query: &AuditQuery) -> Result<BTreeMap<String, AuditRow>, StoreError> {
+    /// The newest entries beside commits that a query asks for, by id. Records come by their newest
+    /// entry, and may overlap.
+    async fn audit_of_the_log(
+        &self,
+        query: &AuditQuery,
+    ) -> Result<BTreeMap<String, AuditRow>, StoreError> {
         // Below the floor they were moved.
         let floor = signed(self.read_floor().await?);
         let (first, last) = ids_of(query);
@@ -306,28 +315,35 @@ impl MongoStore {
         .await
     }
 
-    pub(super) async fn read_answer(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {
+    pub(super) async fn read_answer(
+        &self,
+        id: &str,
+        now: Timestamp,
+    ) -> Result<Option<IdempotencyRecord>, StoreError> {
         let known = self.read_answers(&[id]).await?;
         let valid = known.into_iter().filter(|row| row.expires > now.as_millis());
-        valid
-            .max_by_key(|row| row.revision)
-            .map(IdempotencyRow::decode)
-            .transpose()
+        valid.max_by_key(|row| row.revision).map(IdempotencyRow::decode).transpose()
     }
 
-    /// All answers of these ids, also expired ones. First the log, then what trimming has moved out of it.
-    pub(super) async fn read_answers(&self, ids: &[&str]) -> Result<Vec<IdempotencyRow>, StoreError> {
-        // What is below the floor was moved; a record that is still there may be one that came too late.
+    /// All answers of these ids, also expired ones. First the log, then what trimming has moved out
+    /// of it.
+    pub(super) async fn read_answers(
+        &self,
+        ids: &[&str],
+    ) -> Result<Vec<IdempotencyRow>, StoreError> {
+        // What is below the floor was moved; a record that is still there may be one that came too
+        // late.
         let floor = signed(self.read_floor().await?);
         let find = self
             .tables
             .events
             .find(doc! { "answers._id": { "$in": ids }, "last": { "$gt": floor } });
-        let asked =
-            doc! { "$filter": { "input": "$answers", "as": "answer", "cond": { "$in": ["$$answer._id", ids] } } };
+        let asked = doc! { "$filter": { "input": "$answers", "as": "answer",
+        "cond": { "$in": ["$$answer._id", ids] } } };
         let find = find.projection(doc! { "answers": asked });
         let logged = collect(find, |found| {
-            let answers = rows::members(found, "answers").map(|answer| rows::read_idempotency(answer?));
+            let answers =
+                rows::members(found, "answers").map(|answer| rows::read_idempotency(answer?));
             answers.collect::<Result<Vec<_>, _>>()
         });
         let mut answers: Vec<IdempotencyRow> = logged.await?.into_iter().flatten().collect();
@@ -337,7 +353,11 @@ impl MongoStore {
         Ok(answers)
     }
 
-    pub(super) async fn write_token(&self, token: &TokenRecord, audit: &AuditEntry) -> Result<(), StoreError> {
+    pub(super) async fn write_token(
+        &self,
+        token: &TokenRecord,
+        audit: &AuditEntry,
+    ) -> Result<(), StoreError> {
         let token = rows::token(&TokenRow::encode(token)?);
         let audit = rows::audit(&AuditRow::encode(audit)?);
         self.in_transaction(|tables, session| {
@@ -361,7 +381,8 @@ impl MongoStore {
     ) -> Result<bool, StoreError> {
         let audit = rows::audit(&AuditRow::encode(audit)?);
         // A pipeline, because it depends on what is there: the first time stays.
-        let first = doc! { "$set": { "revoke_time": { "$ifNull": ["$revoke_time", time.as_millis()] } } };
+        let first =
+            doc! { "$set": { "revoke_time": { "$ifNull": ["$revoke_time", time.as_millis()] } } };
         self.in_transaction(|tables, session| {
             let (which, first, audit) = (doc! { "_id": id }, first.clone(), audit.clone());
             async move {
@@ -379,11 +400,7 @@ impl MongoStore {
 
     pub(super) async fn read_tokens(&self, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {
         let filter = doc! { "expire_time": { "$gt": DateTime::from_millis(now.as_millis()) } };
-        let find = self
-            .tables
-            .tokens
-            .find(filter)
-            .sort(doc! { "create_time": -1, "_id": -1 });
+        let find = self.tables.tokens.find(filter).sort(doc! { "create_time": -1, "_id": -1 });
         collect(find, |found| rows::read_token(found)?.decode()).await
     }
 }
@@ -393,9 +410,7 @@ fn keep_wanted(
     wanted: &BTreeMap<&str, i64>,
     texts: &mut BTreeMap<String, String>,
 ) {
-    let those = found
-        .into_iter()
-        .filter(|row| wanted.get(row.key.as_str()) == Some(&row.revision));
+    let those = found.into_iter().filter(|row| wanted.get(row.key.as_str()) == Some(&row.revision));
     texts.extend(those.map(|row| (row.key, row.document)));
 }
 
@@ -413,8 +428,8 @@ fn time_in(record: &Document, revision: i64) -> Result<Option<i64>, StoreError> 
     commit.map(|commit| rows::integer(commit, "time")).transpose()
 }
 
-/// Ids of entries are made in the order of their times, by the same clock: all that a query asks for have an id above the
-/// first one, and below the last one.
+/// Ids of entries are made in the order of their times, by the same clock: all that a query asks
+/// for have an id above the first one, and below the last one.
 fn ids_of(query: &AuditQuery) -> (String, Option<String>) {
     let oldest = now().as_millis() - AUDIT_KEPT_MS;
     let since = query.since.map_or(oldest, |since| since.as_millis().max(oldest));
@@ -436,7 +451,9 @@ fn id_at(milliseconds: i64) -> String {
 
 /// As [`audit_filter`], for one entry of several in a record.
 fn is_asked_for(row: &AuditRow, query: &AuditQuery) -> bool {
-    let is = |wanted: &Option<String>, found: Option<&str>| wanted.is_none() || wanted.as_deref() == found;
+    let is = |wanted: &Option<String>, found: Option<&str>| {
+        wanted.is_none() || wanted.as_deref() == found
+    };
     is(&query.subject, Some(&row.subject))
         && is(&query.kind, row.kind.as_deref())
         && is(&query.name, row.name.as_deref())

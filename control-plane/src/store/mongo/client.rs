@@ -4,13 +4,16 @@ use std::future::IntoFuture;
 use std::time::Duration;
 
 use mongodb::bson::{Document, doc};
-use mongodb::options::{ClientOptions, DatabaseOptions, ReadConcern, ReadPreference, SelectionCriteria, WriteConcern};
+use mongodb::options::{
+    ClientOptions, DatabaseOptions, ReadConcern, ReadPreference, SelectionCriteria, WriteConcern,
+};
 use mongodb::{Client, Collection, Database};
 
 use super::errors::store_error;
 use crate::store::StoreError;
 
-/// Most connections to one server. The committer has one, reads share one query, follow and upkeep have theirs.
+/// Most connections to one server. The committer has one, reads share one query, follow and upkeep
+/// have theirs.
 const CONNECTIONS: u32 = 32;
 /// Until a server is found, where the URI says nothing else: a lost store shows within two seconds.
 const SELECTION: Duration = Duration::from_millis(1_500);
@@ -28,7 +31,8 @@ pub(super) const USUAL: Duration = Duration::from_secs(10);
 /// Reading everything.
 pub(super) const LONG: Duration = Duration::from_secs(120);
 
-/// The collections of a store. All of them read what no crash can take back, and write so that no crash can.
+/// The collections of a store. All of them read what no crash can take back, and write so that no
+/// crash can.
 #[derive(Clone)]
 pub(super) struct Tables {
     pub(super) client: Client,
@@ -48,7 +52,8 @@ pub(super) struct Tables {
     pub(super) tokens: Collection<Document>,
     /// By which our transactions are known among those on the server.
     pub(super) app_name: String,
-    /// Only one member of the replica set can be its primary, as far as was known when it was connected to.
+    /// Only one member of the replica set can be its primary, as far as was known when it was
+    /// connected to.
     pub(super) is_single: bool,
 }
 
@@ -90,13 +95,15 @@ impl Tables {
         let hello = limited(USUAL, tables.admin().run_command(doc! { "hello": 1 })).await?;
         if hello.get_str("msg").is_ok_and(|what| what == "isdbgrid") {
             return Err(StoreError::Refused(
-                "this MongoDB is the router of a sharded cluster: name the members of a replica set of its own"
+                "this MongoDB is the router of a sharded cluster: name the members of a replica \
+                 set of its own"
                     .to_owned(),
             ));
         }
         if hello.get_str("setName").is_err() {
             return Err(StoreError::Refused(
-                "this MongoDB is no replica set, and has no transactions: start mongod with `--replSet rs0`, run \
+                "this MongoDB is no replica set, and has no transactions: start mongod with \
+                 `--replSet rs0`, run \
                  `rs.initiate()` once (one member is enough)"
                     .to_owned(),
             ));
@@ -111,10 +118,11 @@ impl Tables {
     }
 }
 
-/// Every read is answered by the primary, from what a majority of the members has: whoever was told of a commit before
-/// the read began is told of it again. One case is open: a primary that was cut off from the others and does not know it
-/// yet (at most 10 s, until its lease as primary ends) may answer with what was true when it was cut off. It cannot
-/// acknowledge commits. `linearizable` reads would close this for 100 ms each, which is why they are not used.
+/// Every read is answered by the primary, from what a majority of the members has: whoever was told
+/// of a commit before the read began is told of it again. One case is open: a primary that was cut
+/// off from the others and does not know it yet (at most 10 s, until its lease as primary ends) may
+/// answer with what was true when it was cut off. It cannot acknowledge commits. `linearizable`
+/// reads would close this for 100 ms each, which is why they are not used.
 fn database_options() -> DatabaseOptions {
     let mut durable = WriteConcern::majority();
     durable.journal = Some(true);
@@ -157,9 +165,7 @@ pub(super) async fn limited_steps<T>(
     limit: Duration,
     work: impl Future<Output = Result<T, StoreError>>,
 ) -> Result<T, StoreError> {
-    tokio::time::timeout(limit, work)
-        .await
-        .unwrap_or_else(|_| Err(too_slow(limit)))
+    tokio::time::timeout(limit, work).await.unwrap_or_else(|_| Err(too_slow(limit)))
 }
 
 fn too_slow(limit: Duration) -> StoreError {

@@ -13,8 +13,9 @@
 //! Conflict or NotWritten      again ─▶ settle: seal the transaction, then look
 //! ```
 //!
-//! A record begins where the newest one ended, and whoever inserts it first has its revisions: `_id` is unique. See
-//! [`super::fence`] for why nobody can find a revision free that was taken and trimmed away.
+//! A record begins where the newest one ended, and whoever inserts it first has its revisions:
+//! `_id` is unique. See [`super::fence`] for why nobody can find a revision free that was taken and
+//! trimmed away.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -27,8 +28,8 @@ use tokio::time::{Instant, timeout, timeout_at};
 
 use super::client::{QUICK, limited};
 use super::errors::{
-    DUPLICATE_KEY, TOO_SLOW, WRITE_CONFLICT, Wrong, command_code, is_refused, is_write_conflict, not_written,
-    store_error, surely_aborted, was_not_sent, write_code,
+    DUPLICATE_KEY, TOO_SLOW, WRITE_CONFLICT, Wrong, command_code, is_refused, is_write_conflict,
+    not_written, store_error, surely_aborted, was_not_sent, write_code,
 };
 use super::fence::{Proof, since_boot};
 use super::rows::{self, FLOOR};
@@ -48,10 +49,12 @@ const TRIES: usize = 3;
 const SETTLE: Duration = Duration::from_secs(5);
 /// Between two of these tries.
 const PAUSE: Duration = Duration::from_millis(100);
-/// A revision that nobody takes and nobody can write for so long is held by a transaction whose process has gone.
+/// A revision that nobody takes and nobody can write for so long is held by a transaction whose
+/// process has gone.
 const PATIENCE: Duration = Duration::from_millis(500);
 
-/// An insertion that takes longer is held up by a transaction that somebody left open, or by the disk.
+/// An insertion that takes longer is held up by a transaction that somebody left open, or by the
+/// disk.
 const HELD: Duration = Duration::from_secs(1);
 
 /// A statement that failed.
@@ -63,10 +66,7 @@ struct Fault {
 
 impl From<Error> for Fault {
     fn from(error: Error) -> Self {
-        Self {
-            held: is_write_conflict(&error),
-            error: not_written(error),
-        }
+        Self { held: is_write_conflict(&error), error: not_written(error) }
     }
 }
 
@@ -103,9 +103,11 @@ impl MongoStore {
             (_, None) => {}
         }
         if !proof.holds(since_boot())
-            && self.read_floor().await.map_err(CommitError::Unknown)? >= first.revision.unsigned_abs()
+            && self.read_floor().await.map_err(CommitError::Unknown)?
+                >= first.revision.unsigned_abs()
         {
-            // It is below the floor, where nobody looks, or was trimmed already; or it lies under the records of others.
+            // It is below the floor, where nobody looks, or was trimmed already; or it lies under
+            // the records of others.
             self.remove_late(first).await;
             return Err(CommitError::Unknown(stood_still()));
         }
@@ -113,11 +115,16 @@ impl MongoStore {
         Ok(())
     }
 
-    /// Removes what was written too late. If that fails, readers leave it out, and trimming removes it.
+    /// Removes what was written too late. If that fails, readers leave it out, and trimming removes
+    /// it.
     async fn remove_late(&self, first: &EventRow) {
         let ours = doc! { "_id": { "$gte": first.revision }, "batch": &first.batch };
         if let Err(error) = limited(QUICK, self.tables.events.delete_many(ours)).await {
-            tracing::warn!(%error, revision = first.revision, "a commit that came too late could not be removed");
+            tracing::warn!(
+                %error,
+                revision = first.revision,
+                "a commit that came too late could not be removed",
+            );
         }
     }
 
@@ -131,12 +138,12 @@ impl MongoStore {
         proof.ok_or(CommitError::Conflict)
     }
 
-    /// An idempotency key is answered once, until its answer has expired. Whoever else wrote one of these since it was
-    /// looked for has taken the revision, too.
+    /// An idempotency key is answered once, until its answer has expired. Whoever else wrote one of
+    /// these since it was looked for has taken the revision, too.
     async fn refuse_known_answers(&self, group: &[EncodedCommit]) -> Result<(), CommitError> {
-        let rows = group
-            .iter()
-            .filter_map(|commit| Some((commit.idempotency.as_ref()?.id.as_str(), commit.event.time)));
+        let rows = group.iter().filter_map(|commit| {
+            Some((commit.idempotency.as_ref()?.id.as_str(), commit.event.time))
+        });
         let times: BTreeMap<&str, i64> = rows.clone().collect();
         if times.len() < rows.count() {
             return Err(CommitError::Conflict);
@@ -146,7 +153,8 @@ impl MongoStore {
         }
         let ids: Vec<&str> = times.keys().copied().collect();
         let known = self.read_answers(&ids).await.map_err(CommitError::NotWritten)?;
-        let valid = |row: &IdempotencyRow| times.get(row.id.as_str()).is_some_and(|now| row.expires > *now);
+        let valid =
+            |row: &IdempotencyRow| times.get(row.id.as_str()).is_some_and(|now| row.expires > *now);
         match known.iter().any(valid) {
             true => Err(CommitError::Conflict),
             false => Ok(()),
@@ -154,10 +162,16 @@ impl MongoStore {
     }
 
     /// Inserts one record, and finds out what became of it.
-    async fn insert(&self, record: Document, first: &EventRow, proof: Proof) -> Result<(), CommitError> {
+    async fn insert(
+        &self,
+        record: Document,
+        first: &EventRow,
+        proof: Proof,
+    ) -> Result<(), CommitError> {
         let until = Instant::now() + LIMIT;
         let command = doc! {
-            "insert": "events", "documents": [record], "maxTimeMS": i64::try_from(HELD.as_millis()).unwrap_or(i64::MAX),
+            "insert": "events", "documents": [record],
+            "maxTimeMS": i64::try_from(HELD.as_millis()).unwrap_or(i64::MAX),
             "writeConcern": { "w": "majority", "j": true },
         };
         let command = RawDocumentBuf::try_from(&command).map_err(|error| {
@@ -202,13 +216,21 @@ impl MongoStore {
         match timeout(TRY, run).await {
             Ok(Ok(answer)) => match write_code(&answer) {
                 Some(Wrong::Document(code, _)) if code == DUPLICATE_KEY => Tried::Taken,
-                Some(Wrong::Document(code, _)) if [WRITE_CONFLICT, TOO_SLOW].contains(&code) => Tried::Held,
-                Some(Wrong::Document(_, text)) => Tried::Failed(StoreError::Unavailable(format!("MongoDB: {text}"))),
-                Some(Wrong::Concern(text)) => Tried::Unknown(StoreError::Unavailable(format!("MongoDB: {text}"))),
+                Some(Wrong::Document(code, _)) if [WRITE_CONFLICT, TOO_SLOW].contains(&code) => {
+                    Tried::Held
+                }
+                Some(Wrong::Document(_, text)) => {
+                    Tried::Failed(StoreError::Unavailable(format!("MongoDB: {text}")))
+                }
+                Some(Wrong::Concern(text)) => {
+                    Tried::Unknown(StoreError::Unavailable(format!("MongoDB: {text}")))
+                }
                 None => Tried::Written,
             },
             Ok(Err(error)) if command_code(&error) == Some(TOO_SLOW) => Tried::Held,
-            Ok(Err(error)) if was_not_sent(&error) || is_refused(&error) => Tried::Failed(store_error(error)),
+            Ok(Err(error)) if was_not_sent(&error) || is_refused(&error) => {
+                Tried::Failed(store_error(error))
+            }
             Ok(Err(error)) => Tried::Unknown(store_error(error)),
             Err(_) => Tried::Unknown(StoreError::Unavailable(format!(
                 "MongoDB: no answer within {} s",
@@ -221,11 +243,7 @@ impl MongoStore {
     pub(super) async fn batch_at(&self, revision: i64) -> Result<Option<String>, StoreError> {
         // Once a majority has a later write, it has whatever was in the way of the insertion.
         let count = doc! { "$inc": { "count": 1_i64 } };
-        let later = self
-            .tables
-            .meta
-            .update_one(doc! { "_id": "settled" }, count)
-            .upsert(true);
+        let later = self.tables.meta.update_one(doc! { "_id": "settled" }, count).upsert(true);
         limited(QUICK, later).await?;
         let found = self.tables.events.find_one(doc! { "_id": revision });
         let found = limited(QUICK, found.projection(doc! { "batch": 1 })).await?;
@@ -233,8 +251,14 @@ impl MongoStore {
     }
 
     /// Writes in one transaction what is too large for one record.
-    async fn write_large(&self, statements: Statements, first: &EventRow, proof: Proof) -> Result<(), CommitError> {
-        // Always the same session: a transaction on it ends what an earlier one may have left open on the server.
+    async fn write_large(
+        &self,
+        statements: Statements,
+        first: &EventRow,
+        proof: Proof,
+    ) -> Result<(), CommitError> {
+        // Always the same session: a transaction on it ends what an earlier one may have left open
+        // on the server.
         let mut place = self.session.lock().await;
         let mut session = match place.take() {
             Some(session) => session,
@@ -274,7 +298,8 @@ impl MongoStore {
         };
         let done = timeout_at(deadline, work).await;
         let done = done.unwrap_or_else(|_| {
-            let text = format!("MongoDB: the transaction was not done within {} s", LIMIT.as_secs());
+            let text =
+                format!("MongoDB: the transaction was not done within {} s", LIMIT.as_secs());
             Err(Fault {
                 error: CommitError::NotWritten(StoreError::Unavailable(text)),
                 held: false,
@@ -286,15 +311,15 @@ impl MongoStore {
         done
     }
 
-    async fn statements(&self, session: &mut ClientSession, group: Statements) -> Result<(), Fault> {
+    async fn statements(
+        &self,
+        session: &mut ClientSession,
+        group: Statements,
+    ) -> Result<(), Fault> {
         let tables = &self.tables;
         tables.events.insert_many(group.records).session(&mut *session).await?;
         if !group.versions.is_empty() {
-            tables
-                .versions
-                .insert_many(group.versions)
-                .session(&mut *session)
-                .await?;
+            tables.versions.insert_many(group.versions).session(&mut *session).await?;
         }
         Ok(())
     }
@@ -306,7 +331,8 @@ impl MongoStore {
         first: &EventRow,
         deadline: Instant,
     ) -> Result<(), CommitError> {
-        let mut because = StoreError::Unavailable("MongoDB: the commit was not answered in time".to_owned());
+        let mut because =
+            StoreError::Unavailable("MongoDB: the commit was not answered in time".to_owned());
         for _ in 0..TRIES {
             match timeout(TRY, session.commit_transaction()).await {
                 Ok(Ok(())) => return Ok(()),
@@ -346,21 +372,17 @@ impl MongoStore {
         }
     }
 
-    /// A later transaction of the same session: once it is committed by a majority, the one before it is committed or
-    /// never will be, and what this one saw is what is true.
-    async fn seal(&self, session: &mut ClientSession, revision: i64) -> mongodb::error::Result<Seen> {
+    /// A later transaction of the same session: once it is committed by a majority, the one before
+    /// it is committed or never will be, and what this one saw is what is true.
+    async fn seal(
+        &self,
+        session: &mut ClientSession,
+        revision: i64,
+    ) -> mongodb::error::Result<Seen> {
         let tables = &self.tables;
         begin(session).await?;
-        let event = tables
-            .events
-            .find_one(doc! { "_id": revision })
-            .session(&mut *session)
-            .await?;
-        let floor = tables
-            .documents
-            .find_one(doc! { "_id": FLOOR })
-            .session(&mut *session)
-            .await?;
+        let event = tables.events.find_one(doc! { "_id": revision }).session(&mut *session).await?;
+        let floor = tables.documents.find_one(doc! { "_id": FLOOR }).session(&mut *session).await?;
         let count = doc! { "$inc": { "count": 1_i64 } };
         tables
             .meta
@@ -378,7 +400,8 @@ impl MongoStore {
         })
     }
 
-    /// Whether this revision has been held by an open transaction for as long as no live process takes.
+    /// Whether this revision has been held by an open transaction for as long as no live process
+    /// takes.
     fn is_held_for_long(&self, revision: i64, held: bool) -> bool {
         let mut since = self.held.lock();
         if !held {

@@ -12,7 +12,8 @@ const SNAPSHOT_UNAVAILABLE: i32 = 246;
 /// Longer than `maxTimeMS`.
 pub(super) const TOO_SLOW: i32 = 50;
 pub(super) const NAMESPACE_EXISTS: i32 = 48;
-/// Another transaction holds a lock, or this one was replaced by a newer one of its session, or was ended for it.
+/// Another transaction holds a lock, or this one was replaced by a newer one of its session, or was
+/// ended for it.
 const OTHER_TRANSACTION: [i32; 4] = [24, 225, 267, 290];
 /// No right, wrong password, not a replica set, no such command: waiting does not help.
 const NEVER: [i32; 4] = [13, 18, 20, 59];
@@ -28,7 +29,9 @@ pub(super) fn store_error(error: Error) -> StoreError {
         | ErrorKind::IncompatibleServer { .. }
         | ErrorKind::SessionsNotSupported => StoreError::Refused(format!("MongoDB: {text}")),
         ErrorKind::Bson(_) => StoreError::Corrupt(format!("MongoDB: {text}")),
-        _ if codes(&error).iter().any(|code| NEVER.contains(code)) => StoreError::Refused(format!("MongoDB: {text}")),
+        _ if codes(&error).iter().any(|code| NEVER.contains(code)) => {
+            StoreError::Refused(format!("MongoDB: {text}"))
+        }
         _ => StoreError::Unavailable(format!("MongoDB: {text}")),
     }
 }
@@ -46,13 +49,14 @@ pub(super) fn not_written(error: Error) -> CommitError {
     }
 }
 
-/// Whether an open transaction of somebody else is in the way: the revision may not have been taken at all.
+/// Whether an open transaction of somebody else is in the way: the revision may not have been taken
+/// at all.
 pub(super) fn is_write_conflict(error: &Error) -> bool {
     codes(error).iter().any(|code| *code == WRITE_CONFLICT || *code == 24)
 }
 
-/// Whether a command that failed like this has never left this process. A pool that was cleared says nothing: commands that
-/// were sent already fail by it, too.
+/// Whether a command that failed like this has never left this process. A pool that was cleared
+/// says nothing: commands that were sent already fail by it, too.
 pub(super) fn was_not_sent(error: &Error) -> bool {
     matches!(
         error.kind.as_ref(),
@@ -100,9 +104,7 @@ fn codes(error: &Error) -> Vec<i32> {
         ErrorKind::Write(WriteFailure::WriteConcernError(concern)) => vec![concern.code],
         ErrorKind::InsertMany(many) => {
             let writes = many.write_errors.iter().flatten().map(|write| write.code);
-            writes
-                .chain(many.write_concern_error.as_ref().map(|concern| concern.code))
-                .collect()
+            writes.chain(many.write_concern_error.as_ref().map(|concern| concern.code)).collect()
         }
         _ => Vec::new(),
     }
@@ -133,7 +135,9 @@ pub(super) fn write_code(answer: &Document) -> Option<Wrong> {
 /// What is wrong with an answer, for a command that may be done again.
 pub(super) fn write_error(answer: &Document) -> Option<StoreError> {
     write_code(answer).map(|wrong| match wrong {
-        Wrong::Document(_, text) | Wrong::Concern(text) => StoreError::Unavailable(format!("MongoDB: {text}")),
+        Wrong::Document(_, text) | Wrong::Concern(text) => {
+            StoreError::Unavailable(format!("MongoDB: {text}"))
+        }
     })
 }
 
@@ -147,11 +151,9 @@ mod tests {
     fn errors_of_single_documents_are_seen() {
         assert_eq!(write_code(&doc! { "ok": 1, "n": 1 }), None);
         assert_eq!(write_code(&doc! { "ok": 1, "writeErrors": [] }), None);
-        let taken = doc! { "ok": 1, "writeErrors": [{ "index": 0, "code": 11_000, "errmsg": "E11000" }] };
-        assert_eq!(
-            write_code(&taken),
-            Some(Wrong::Document(DUPLICATE_KEY, "E11000".to_owned()))
-        );
+        let taken =
+            doc! { "ok": 1, "writeErrors": [{ "index": 0, "code": 11_000, "errmsg": "E11000" }] };
+        assert_eq!(write_code(&taken), Some(Wrong::Document(DUPLICATE_KEY, "E11000".to_owned())));
         let late = doc! { "ok": 1, "n": 1, "writeConcernError": { "code": 64, "errmsg": "late" } };
         assert_eq!(write_code(&late), Some(Wrong::Concern("late".to_owned())));
         assert!(matches!(write_error(&taken), Some(StoreError::Unavailable(_))));
@@ -162,9 +164,6 @@ mod tests {
         let io = Error::from(std::io::Error::from(std::io::ErrorKind::ConnectionReset));
         assert!(store_error(io.clone()).is_transient());
         assert!(!was_not_sent(&io), "it may have arrived");
-        assert!(matches!(
-            not_written(io),
-            CommitError::NotWritten(StoreError::Unavailable(_))
-        ));
+        assert!(matches!(not_written(io), CommitError::NotWritten(StoreError::Unavailable(_))));
     }
 }

@@ -1,4 +1,5 @@
-//! What lets one insertion be a whole commit, although what it rests on may be trimmed away meanwhile.
+//! What lets one insertion be a whole commit, although what it rests on may be trimmed away
+//! meanwhile.
 //!
 //! ```text
 //! n was the newest at t ──▶ insert n + 1 ──▶ answered before t + 60 s: nobody can have removed another n + 1
@@ -6,10 +7,11 @@
 //! removed are only commits that this process saw at least 120 s ago
 //! ```
 //!
-//! A record of the log begins where the newest one ended, and its first revision is unique: who is second finds it taken.
-//! Only where it was taken *and removed again* would a late insertion succeed. So a process inserts only soon after it
-//! knew that its revision was free, and removes only long after it saw that it was taken. Times are those that a process
-//! measures by itself, from the start of its machine, also while that slept: no two clocks are ever compared, they must
+//! A record of the log begins where the newest one ended, and its first revision is unique: who is
+//! second finds it taken. Only where it was taken *and removed again* would a late insertion
+//! succeed. So a process inserts only soon after it knew that its revision was free, and removes
+//! only long after it saw that it was taken. Times are those that a process measures by itself,
+//! from the start of its machine, also while that slept: no two clocks are ever compared, they must
 //! only run less than twice as fast as each other.
 
 use std::collections::VecDeque;
@@ -26,7 +28,8 @@ const SEEN: Duration = Duration::from_secs(120);
 /// Between two notes of what was seen.
 const NOTED: Duration = Duration::from_secs(10);
 
-/// Since the start of this machine. A machine that cannot tell makes every proof too old, and removes nothing.
+/// Since the start of this machine. A machine that cannot tell makes every proof too old, and
+/// removes nothing.
 pub(super) fn since_boot() -> Option<Duration> {
     clock_gettime(ClockId::CLOCK_BOOTTIME).ok().map(Duration::from)
 }
@@ -41,8 +44,7 @@ pub(super) struct Proof {
 impl Proof {
     /// Whether what was inserted on this proof cannot have been removed before, at `now`.
     pub(super) fn holds(self, now: Option<Duration>) -> bool {
-        now.and_then(|now| now.checked_sub(self.at))
-            .is_some_and(|age| age <= CERTAIN)
+        now.and_then(|now| now.checked_sub(self.at)).is_some_and(|age| age <= CERTAIN)
     }
 }
 
@@ -65,26 +67,23 @@ impl Default for Fence {
 impl Fence {
     /// One that is in more of a hurry than is safe.
     pub(super) fn removing_after(patience: Duration) -> Self {
-        Self {
-            newest: None,
-            patience,
-            seen: VecDeque::new(),
-        }
+        Self { newest: None, patience, seen: VecDeque::new() }
     }
 
     /// The store was asked at `asked`, and its newest revision was this one, then or later.
-    pub(super) fn newest_was(&mut self, revision: i64, asked: Option<Duration>, now: Option<Duration>) {
+    pub(super) fn newest_was(
+        &mut self,
+        revision: i64,
+        asked: Option<Duration>,
+        now: Option<Duration>,
+    ) {
         let (Some(at), Some(now)) = (asked, now) else { return };
         match &mut self.newest {
             Some(known) if known.revision > revision => {}
             Some(known) if known.revision == revision => known.at = known.at.max(at),
             known => *known = Some(Proof { revision, at }),
         }
-        if self
-            .seen
-            .back()
-            .is_none_or(|(last, _)| now >= *last + NOTED.min(self.patience))
-        {
+        if self.seen.back().is_none_or(|(last, _)| now >= *last + NOTED.min(self.patience)) {
             self.seen.push_back((now, revision));
         }
         // Of those that are old enough, the newest says it all.
@@ -152,7 +151,8 @@ mod tests {
 
     #[test]
     fn an_insertion_that_counts_was_there_before_any_removal() {
-        // Worst case, with one clock twice as fast: inserted on a proof of 60 s by the slow clock, 120 s by the fast one.
+        // Worst case, with one clock twice as fast: inserted on a proof of 60 s by the slow clock,
+        // 120 s by the fast one.
         assert!(CERTAIN * 2 <= SEEN);
         assert!(FRESH < CERTAIN);
     }

@@ -6,9 +6,10 @@
 //! loading = documents of r, some of which are newer already, and the commits above r
 //! ```
 //!
-//! However often a document has changed, it is written once. Each read and each step counts up `turn` in the guard, and
-//! finds it as the one before has left it: of two processes that are at it one is overtaken, and stops. What it has written
-//! stays, and harms nobody: whatever changed above r is taken from the log.
+//! However often a document has changed, it is written once. Each read and each step counts up
+//! `turn` in the guard, and finds it as the one before has left it: of two processes that are at it
+//! one is overtaken, and stops. What it has written stays, and harms nobody: whatever changed above
+//! r is taken from the log.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -29,10 +30,11 @@ use crate::store::StoreError;
 use crate::store::encode::signed;
 use crate::store::rows::VersionRow;
 
-/// Between two times that the documents are brought up to date, by whichever process. If another one was at it, this one
-/// looks again after as long.
+/// Between two times that the documents are brought up to date, by whichever process. If another
+/// one was at it, this one looks again after as long.
 pub(super) const FOLD_PERIOD: Duration = Duration::from_secs(30);
-/// How much longer it may take until it hurries: what is behind has to be read, and kept in memory, by whoever starts.
+/// How much longer it may take until it hurries: what is behind has to be read, and kept in memory,
+/// by whoever starts.
 const LATE: Duration = Duration::from_secs(30);
 /// Records, and bytes of them, that are read at once.
 const RECORDS: usize = 1_000;
@@ -48,8 +50,8 @@ const STEP_BYTES: usize = 1024 * 1024;
 const REST: u32 = 3;
 /// The longest of them.
 const LONGEST_REST: Duration = Duration::from_millis(500);
-/// Before one that was overtaken looks again, if it cannot wait: longer than what another one that is in a hurry needs
-/// between two of its turns.
+/// Before one that was overtaken looks again, if it cannot wait: longer than what another one that
+/// is in a hurry needs between two of its turns.
 const AGAIN: std::ops::Range<Duration> = Duration::from_millis(100)..Duration::from_millis(500);
 /// Revisions whose records one command removes.
 const REMOVED: i64 = 1_000;
@@ -108,7 +110,8 @@ impl Gathered {
     pub(super) fn steps(self) -> Vec<Vec<VersionRow>> {
         let (mut steps, mut bytes) = (vec![Vec::new()], 0);
         for row in self.rows.into_values() {
-            let is_full = steps.last().is_some_and(|step: &Vec<_>| step.len() >= STEP) || bytes >= STEP_BYTES;
+            let is_full =
+                steps.last().is_some_and(|step: &Vec<_>| step.len() >= STEP) || bytes >= STEP_BYTES;
             if is_full {
                 steps.push(Vec::new());
                 bytes = 0;
@@ -172,8 +175,8 @@ impl MongoStore {
         }
     }
 
-    /// Brings the documents from those of a guard to a revision; `false` if another one has overtaken it, or has rewritten
-    /// them.
+    /// Brings the documents from those of a guard to a revision; `false` if another one has
+    /// overtaken it, or has rewritten them.
     async fn fold(&self, mut guard: Guard, until: i64, pace: Pace) -> Result<bool, StoreError> {
         while guard.folded < until {
             let Some((claimed, gathered)) = self.gather(guard, until, pace).await? else {
@@ -199,14 +202,16 @@ impl MongoStore {
         Ok(true)
     }
 
-    /// What the documents are that changed up to a revision, or up to one before it if there is much; `None` if another one
-    /// has overtaken this. The turn is taken before each read, so that all see who is at it. What this process has written
-    /// itself is not read.
-    async fn gather(&self, mut guard: Guard, until: i64, pace: Pace) -> Result<Option<(Guard, Gathered)>, StoreError> {
-        let mut gathered = Gathered {
-            revision: guard.folded,
-            ..Gathered::default()
-        };
+    /// What the documents are that changed up to a revision, or up to one before it if there is
+    /// much; `None` if another one has overtaken this. The turn is taken before each read, so that
+    /// all see who is at it. What this process has written itself is not read.
+    async fn gather(
+        &self,
+        mut guard: Guard,
+        until: i64,
+        pace: Pace,
+    ) -> Result<Option<(Guard, Gathered)>, StoreError> {
+        let mut gathered = Gathered { revision: guard.folded, ..Gathered::default() };
         loop {
             let begun = Instant::now();
             match self.step(guard, guard.folded, &[], pace).await? {
@@ -245,8 +250,8 @@ impl MongoStore {
         }
     }
 
-    /// What this process has written itself above the documents, if that is all that was written, and if the log still has
-    /// it: a database that was set back to an earlier time has not.
+    /// What this process has written itself above the documents, if that is all that was written,
+    /// and if the log still has it: a database that was set back to an earlier time has not.
     async fn take_recent(&self, guard: Guard) -> Result<Option<Gathered>, StoreError> {
         let Some(last) = self.recent.lock().last() else {
             return Ok(None);
@@ -259,7 +264,8 @@ impl MongoStore {
         Ok(recent.take_above(guard))
     }
 
-    /// One transaction: the next turn, and documents. Gives the guard as it is then; `None` if it was another one before.
+    /// One transaction: the next turn, and documents. Gives the guard as it is then; `None` if it
+    /// was another one before.
     async fn step(
         &self,
         guard: Guard,
@@ -268,7 +274,8 @@ impl MongoStore {
         pace: Pace,
     ) -> Result<Option<Guard>, StoreError> {
         let turn = guard.turn + 1;
-        let mut commands = vec![advance(guard.not_folded(), doc! { "turn": turn, "folded": folded })];
+        let mut commands =
+            vec![advance(guard.not_folded(), doc! { "turn": turn, "folded": folded })];
         commands.extend(document_updates(rows));
         if !self.guarded(commands).await? {
             return Ok(None);
@@ -279,7 +286,8 @@ impl MongoStore {
         Ok(Some(Guard { turn, folded, ..guard }))
     }
 
-    /// Runs commands in one transaction; the first one must find the guard as it was. `false` if it did not.
+    /// Runs commands in one transaction; the first one must find the guard as it was. `false` if it
+    /// did not.
     pub(super) async fn guarded(&self, commands: Vec<Document>) -> Result<bool, StoreError> {
         let commands = Arc::new(commands);
         let failed = Arc::new(parking_lot::Mutex::new(None));
@@ -308,10 +316,13 @@ impl MongoStore {
         failed.map_or(Ok(done), Err)
     }
 
-    /// Removes records across a revision under which others lie: they came too late, see [`super::fence`].
+    /// Removes records across a revision under which others lie: they came too late, see
+    /// [`super::fence`].
     async fn remove_late_below(&self, revision: i64) -> Result<(), StoreError> {
-        let across =
-            doc! { "_id": { "$lte": revision, "$gt": revision - RECORD_COMMITS }, "last": { "$gt": revision } };
+        let across = doc! {
+            "_id": { "$lte": revision, "$gt": revision - RECORD_COMMITS },
+            "last": { "$gt": revision },
+        };
         let events = &self.tables.events;
         let found = events.find(across).projection(doc! { "last": 1, "batch": 1 });
         let across = collect(found, |found| {
@@ -330,7 +341,8 @@ impl MongoStore {
         Ok(())
     }
 
-    /// Removes records that are wholly below the floor, but never the newest one, and only those that were seen long ago.
+    /// Removes records that are wholly below the floor, but never the newest one, and only those
+    /// that were seen long ago.
     pub(super) async fn remove_records(&self, floor: i64) -> Result<(), StoreError> {
         let removable = self.fence.lock().removable(since_boot()).min(floor);
         if removable <= *self.removed.lock() {
@@ -340,16 +352,15 @@ impl MongoStore {
         let events = &self.tables.events;
         let mut place = 0;
         loop {
-            let oldest = events
-                .find_one(doc! { "_id": { "$gt": place } })
-                .sort(doc! { "_id": 1 });
+            let oldest = events.find_one(doc! { "_id": { "$gt": place } }).sort(doc! { "_id": 1 });
             let oldest = limited(USUAL, oldest.projection(doc! { "_id": 1 })).await?;
             let oldest = oldest.map(|found| rows::integer(&found, "_id")).transpose()?;
             let Some(oldest) = oldest.filter(|oldest| *oldest <= removable) else {
                 break;
             };
             place = removable.min(oldest + REMOVED);
-            let gone = doc! { "_id": { "$lte": place }, "last": { "$lte": removable.min(newest - 1) } };
+            let gone =
+                doc! { "_id": { "$lte": place }, "last": { "$lte": removable.min(newest - 1) } };
             limited(USUAL, events.delete_many(gone)).await?;
         }
         self.remove_late_below(removable).await?;
@@ -408,10 +419,7 @@ mod tests {
             ("Node/a", 4, "delete"),
         ] {
             let op = op.to_owned();
-            gathered.add(VersionRow {
-                op,
-                ..row(key, revision, 10)
-            });
+            gathered.add(VersionRow { op, ..row(key, revision, 10) });
         }
         let steps = gathered.steps();
         let commands = document_updates(&steps[0]);
@@ -419,7 +427,10 @@ mod tests {
         assert_eq!(commands[0].get_array("updates").unwrap().len(), 1);
         assert_eq!(
             commands[1],
-            doc! { "delete": "documents", "deletes": [{ "q": { "_id": { "$in": ["Node/a"] } }, "limit": 0 }] }
+            doc! {
+                "delete": "documents",
+                "deletes": [{ "q": { "_id": { "$in": ["Node/a"] } }, "limit": 0 }],
+            }
         );
     }
 

@@ -1,8 +1,9 @@
 //! Hearing of other processes' commits.
 //!
-//! A change stream only wakes: what there is, is read from the log. So it may fail, repeat itself or come late without
-//! harm; while there is none, the log is looked at every 100 ms. A process that is alone on the database needs none: it
-//! hears of another one before that writes ([`super::members`]). It may keep an idle one all the same, for speed.
+//! A change stream only wakes: what there is, is read from the log. So it may fail, repeat itself
+//! or come late without harm; while there is none, the log is looked at every 100 ms. A process
+//! that is alone on the database needs none: it hears of another one before that writes
+//! ([`super::members`]). It may keep an idle one all the same, for speed.
 
 use std::time::Duration;
 
@@ -19,8 +20,8 @@ use super::client::{QUICK, limited};
 const POLL: Duration = Duration::from_millis(100);
 /// A stream may be cut without a word from the network.
 const AT_LATEST: Duration = Duration::from_secs(1);
-/// Looks at whether it is still alone until the log is read all the same: a commit may be found there of which it was not
-/// known whether it was written.
+/// Looks at whether it is still alone until the log is read all the same: a commit may be found
+/// there of which it was not known whether it was written.
 const LOOKS: usize = 10;
 
 /// A change stream that is open.
@@ -68,9 +69,10 @@ impl MongoStore {
         }
     }
 
-    /// A member that is alone in its set makes a durable write wait for the next whole millisecond, unless somebody follows
-    /// its oplog, as other members would. So this process does, where it costs least: a stream of the commits would cost the
-    /// database as much as they do, all of which are our own.
+    /// A member that is alone in its set makes a durable write wait for the next whole millisecond,
+    /// unless somebody follows its oplog, as other members would. So this process does, where it
+    /// costs least: a stream of the commits would cost the database as much as they do, all of
+    /// which are our own.
     async fn open_idle(&self, place: &mut Option<Stream>) {
         if matches!(place, Some(Stream::Idle(_))) {
             return;
@@ -79,14 +81,20 @@ impl MongoStore {
         if self.tables.is_single {
             match limited(QUICK, self.tables.migrations.watch()).await {
                 Ok(stream) => *place = Some(Stream::Idle(stream)),
-                Err(error) => tracing::debug!(%error, "no idle change stream: writes wait for whole milliseconds"),
+                Err(error) => {
+                    tracing::debug!(
+                        %error,
+                        "no idle change stream: writes wait for whole milliseconds",
+                    )
+                }
             }
         }
     }
 
     async fn open_stream(&self) -> Result<Changes, crate::store::StoreError> {
         let pipeline = [
-            doc! { "$match": { "operationType": "insert", "fullDocument.writer": { "$ne": &self.writer } } },
+            doc! { "$match": { "operationType": "insert",
+            "fullDocument.writer": { "$ne": &self.writer } } },
             doc! { "$project": { "fullDocument": 0 } },
         ];
         limited(QUICK, self.tables.events.watch().pipeline(pipeline)).await

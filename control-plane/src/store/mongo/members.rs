@@ -9,12 +9,14 @@
 //! just come, or back after being left out: 1.1 s without reads and writes, for somebody may still read from memory
 //! ```
 //!
-//! Why this holds, in the words of a client: what another process had acknowledged is never missing from a read that begins
-//! later. A process reads and writes only 1.1 s after it stands in the table; by then whoever was alone has seen it there,
-//! or could not look for 800 ms. Who is left out was silent for 120 s, and had counted itself out after 60 s: a commit of
-//! it that is found in the log all the same was answered with "unknown", and counts from when it is found.
+//! Why this holds, in the words of a client: what another process had acknowledged is never missing
+//! from a read that begins later. A process reads and writes only 1.1 s after it stands in the
+//! table; by then whoever was alone has seen it there, or could not look for 800 ms. Who is left
+//! out was silent for 120 s, and had counted itself out after 60 s: a commit of it that is found in
+//! the log all the same was answered with "unknown", and counts from when it is found.
 //!
-//! Times are those that a process measures by itself, as in [`super::fence`]: no two clocks are compared.
+//! Times are those that a process measures by itself, as in [`super::fence`]: no two clocks are
+//! compared.
 
 use std::collections::BTreeMap;
 use std::future::IntoFuture as _;
@@ -37,7 +39,8 @@ use crate::store::encode::corrupt;
 
 /// Between two exchanges, while there are reads.
 const BEAT: Duration = Duration::from_millis(250);
-/// The same after [`IDLE_BEATS`] of them without reads: each one is a write to the disks of the database.
+/// The same after [`IDLE_BEATS`] of them without reads: each one is a write to the disks of the
+/// database.
 const IDLE_BEAT: Duration = Duration::from_secs(10);
 const IDLE_BEATS: u32 = 40;
 /// Between two looks at the table meanwhile: whoever comes is seen before it writes.
@@ -97,8 +100,8 @@ impl Standing {
         }
     }
 
-    /// Whether one that is in the table at an exchange has been there since its last one. After long it may have been left
-    /// out and be in it again, by an exchange of which it heard nothing.
+    /// Whether one that is in the table at an exchange has been there since its last one. After
+    /// long it may have been left out and be in it again, by an exchange of which it heard nothing.
     fn has_stayed(&self, asked: Option<Duration>) -> bool {
         let age = asked.zip(self.beat).and_then(|(asked, beat)| asked.checked_sub(beat));
         age.is_some_and(|age| age <= VALID)
@@ -127,10 +130,7 @@ impl Table {
             let member = member?;
             beats.insert(rows::text(member, "id")?, rows::integer(member, "beat")?);
         }
-        Ok(Self {
-            turn: rows::integer(found, "turn")?,
-            beats,
-        })
+        Ok(Self { turn: rows::integer(found, "turn")?, beats })
     }
 
     fn write(&self) -> Document {
@@ -193,8 +193,11 @@ struct Reads {
 
 impl Reads {
     fn note(&self) {
-        // Most find that there was one just now, and write nothing that other threads have to hear of.
-        if self.idle.load(Ordering::Relaxed) > 0 && self.idle.swap(0, Ordering::Relaxed) >= IDLE_BEATS {
+        // Most find that there was one just now, and write nothing that other threads have to hear
+        // of.
+        if self.idle.load(Ordering::Relaxed) > 0
+            && self.idle.swap(0, Ordering::Relaxed) >= IDLE_BEATS
+        {
             self.began.notify_one();
         }
     }
@@ -225,12 +228,7 @@ impl Members {
         let leave = CancellationToken::new();
         let mut tasks = JoinSet::new();
         tasks.spawn(beating.run(leave.clone()));
-        Ok(Self {
-            standing,
-            beating: tokio::sync::Mutex::new(tasks),
-            leave,
-            reads,
-        })
+        Ok(Self { standing, beating: tokio::sync::Mutex::new(tasks), leave, reads })
     }
 
     /// The revision above which nobody else has written anything; none if others may have.
@@ -239,12 +237,14 @@ impl Members {
         self.standing.borrow().alone(since_boot())
     }
 
-    /// Whether no other process was there at the last exchange, however long ago that is: half a second where all is well.
+    /// Whether no other process was there at the last exchange, however long ago that is: half a
+    /// second where all is well.
     pub(super) fn is_alone(&self) -> bool {
         self.standing.borrow().alone.is_some()
     }
 
-    /// Waits until this process may read and write. Which time in the table it is, for [`Members::is_still`].
+    /// Waits until this process may read and write. Which time in the table it is, for
+    /// [`Members::is_still`].
     ///
     /// # Errors
     /// [`StoreError::Unavailable`] if it may not within two seconds.
@@ -285,8 +285,8 @@ impl Members {
 }
 
 fn left_out() -> StoreError {
-    let text =
-        "MongoDB: this process could not enter itself among those that use the database, see the collection `meta`";
+    let text = "MongoDB: this process could not enter itself among those that use the database, \
+        see the collection `meta`";
     StoreError::Unavailable(text.to_owned())
 }
 
@@ -314,7 +314,8 @@ impl Beating {
         }
     }
 
-    /// Waits for the time of the next exchange: when nobody reads, until somebody does, or another process comes.
+    /// Waits for the time of the next exchange: when nobody reads, until somebody does, or another
+    /// process comes.
     async fn next_time(&self) {
         if !self.reads.are_idle() {
             return tokio::time::sleep(BEAT).await;
@@ -322,7 +323,8 @@ impl Beating {
         let until = Instant::now() + IDLE_BEAT;
         while Instant::now() < until {
             let has_begun = timeout(LOOK, self.reads.began.notified()).await.is_ok();
-            let is_mine = |table: Table| self.last.as_ref().is_some_and(|last| last.turn == table.turn);
+            let is_mine =
+                |table: Table| self.last.as_ref().is_some_and(|last| last.turn == table.turn);
             if has_begun || !self.read().await.is_ok_and(is_mine) {
                 return;
             }
@@ -338,7 +340,8 @@ impl Beating {
                 Some(table) => table,
                 None => self.read().await?,
             };
-            let silent = asked.map_or_else(Vec::new, |now| self.heard.silent(&table, &self.me, now));
+            let silent =
+                asked.map_or_else(Vec::new, |now| self.heard.silent(&table, &self.me, now));
             let next = table.next(&self.me, &silent);
             if next.beats.len() > MOST {
                 let text = format!("MongoDB: {MOST} processes use this database already");
@@ -381,7 +384,8 @@ impl Beating {
     /// Whether it was still the old one that was replaced.
     async fn write(&self, old: &Table, new: &Table) -> Result<bool, StoreError> {
         if old.turn == 0 {
-            let insert = timeout(QUICK, self.tables.meta.insert_one(new.write()).into_future()).await;
+            let insert =
+                timeout(QUICK, self.tables.meta.insert_one(new.write()).into_future()).await;
             return match insert {
                 Ok(Ok(_)) => Ok(true),
                 Ok(Err(error)) if is_duplicate(&error) => Ok(false),
@@ -429,12 +433,8 @@ mod tests {
 
     #[test]
     fn one_that_is_alone_reads_from_memory_for_a_while() {
-        let standing = Standing {
-            joined: 1,
-            beat: Some(at(10_000)),
-            from: at(10_010),
-            alone: Some(7),
-        };
+        let standing =
+            Standing { joined: 1, beat: Some(at(10_000)), from: at(10_010), alone: Some(7) };
         for (now, may, alone) in [
             (9_999, May::Not, None),
             (10_000, May::After(at(10)), None),
@@ -450,19 +450,13 @@ mod tests {
         assert_eq!(standing.may(None), May::Not);
         assert_eq!(standing.alone(None), None);
         assert_eq!(Standing::default().may(Some(at(1))), May::Not);
-        let others = Standing {
-            alone: None,
-            ..standing
-        };
+        let others = Standing { alone: None, ..standing };
         assert_eq!(others.alone(Some(at(10_020))), None);
     }
 
     #[test]
     fn one_that_heard_nothing_for_long_comes_anew() {
-        let standing = Standing {
-            beat: Some(at(10_000)),
-            ..Standing::default()
-        };
+        let standing = Standing { beat: Some(at(10_000)), ..Standing::default() };
         for (asked, stayed) in [
             (Some(10_000), true),
             (Some(70_000), true),

@@ -5,8 +5,8 @@
 //! step ─▶ renew, if the fence is still mine ─▶ do ─▶ transaction: fence is still mine, record the step
 //! ```
 //!
-//! A process that was stopped within a step and wakes up after its lease ran out does that step again, which changes
-//! nothing, and can record nothing any more.
+//! A process that was stopped within a step and wakes up after its lease ran out does that step
+//! again, which changes nothing, and can record nothing any more.
 
 use std::time::Duration;
 
@@ -72,12 +72,9 @@ impl MongoStore {
     }
 
     async fn insert_floor(&self) -> Result<(), StoreError> {
-        let floor = doc! { "$setOnInsert": { FLOOR: 0_i64, "folded": 0_i64, "turn": 0_i64, "rewrites": 0_i64 } };
-        let insert = self
-            .tables
-            .documents
-            .update_one(doc! { "_id": FLOOR }, floor)
-            .upsert(true);
+        let floor = doc! { "$setOnInsert": { FLOOR: 0_i64, "folded": 0_i64, "turn": 0_i64,
+        "rewrites": 0_i64 } };
+        let insert = self.tables.documents.update_one(doc! { "_id": FLOOR }, floor).upsert(true);
         limited(USUAL, insert).await?;
         Ok(())
     }
@@ -116,10 +113,12 @@ impl MongoStore {
     async fn take_lease(&self) -> Result<Option<i64>, StoreError> {
         let run_out = doc! { "_id": "lease", "$expr": { "$lt": ["$until", "$$NOW"] } };
         let take = doc! { "$set": {
-            "holder": &self.writer, "until": { "$add": ["$$NOW", LEASE_MS] }, "fence": { "$add": ["$fence", 1_i64] },
+            "holder": &self.writer, "until": { "$add": ["$$NOW", LEASE_MS] },
+            "fence": { "$add": ["$fence", 1_i64] },
         } };
         let take = self.tables.meta.find_one_and_update(run_out, vec![take]);
-        let taken = limited(USUAL, take.return_document(mongodb::options::ReturnDocument::After)).await?;
+        let taken =
+            limited(USUAL, take.return_document(mongodb::options::ReturnDocument::After)).await?;
         taken.map(|lease| rows::integer(&lease, "fence")).transpose()
     }
 
@@ -130,7 +129,8 @@ impl MongoStore {
         match half {
             false => Ok(()),
             true => Err(StoreError::Refused(format!(
-                "a restore into the database {} was not finished: drop the database, and restore again",
+                "a restore into the database {} was not finished: drop the database, and restore \
+                 again",
                 self.tables.database.name()
             ))),
         }
@@ -147,7 +147,8 @@ impl Lease<'_> {
     }
 
     async fn renew(&self) -> Result<(), StoreError> {
-        let renewed = limited(USUAL, self.store.tables.meta.update_one(self.mine(), Self::renewal())).await?;
+        let renewed =
+            limited(USUAL, self.store.tables.meta.update_one(self.mine(), Self::renewal())).await?;
         match renewed.matched_count {
             0 => Err(lost()),
             _ => Ok(()),
@@ -156,7 +157,9 @@ impl Lease<'_> {
 
     async fn give_back(&self) {
         let free = doc! { "$set": { "until": mongodb::bson::DateTime::MIN } };
-        if let Err(error) = limited(USUAL, self.store.tables.meta.update_one(self.mine(), free)).await {
+        if let Err(error) =
+            limited(USUAL, self.store.tables.meta.update_one(self.mine(), free)).await
+        {
             tracing::debug!(%error, "the lease for migrations runs out by itself");
         }
     }
@@ -164,17 +167,15 @@ impl Lease<'_> {
     async fn record(&self, done: &Done) -> Result<(), StoreError> {
         let record = doc! {
             "_id": format!("{:04}.{:04}", done.number, done.step), "number": i64::from(done.number),
-            "step": i64::from(done.step), "name": &done.name, "checksum": &done.checksum, "time": now().as_millis(),
+            "step": i64::from(done.step), "name": &done.name, "checksum": &done.checksum,
+            "time": now().as_millis(),
         };
         let mine = self.mine();
         let recorded = self.store.in_transaction(|tables, session| {
             let (mine, record) = (mine.clone(), record.clone());
             async move {
-                let renewed = tables
-                    .meta
-                    .update_one(mine, Self::renewal())
-                    .session(&mut *session)
-                    .await?;
+                let renewed =
+                    tables.meta.update_one(mine, Self::renewal()).session(&mut *session).await?;
                 if renewed.matched_count == 0 {
                     return Ok(false);
                 }
@@ -223,9 +224,7 @@ impl Target for Lease<'_> {
             Action::Command(text) => {
                 let command: serde_json::Value = serde_json::from_str(text).map_err(corrupt)?;
                 let command = mongodb::bson::serialize_to_document(&command);
-                self.store
-                    .command(command.map_err(|error| store_error(error.into()))?)
-                    .await?;
+                self.store.command(command.map_err(|error| store_error(error.into()))?).await?;
             }
             Action::Rewrite { function, .. } => {
                 let renew = || self.renew().boxed();

@@ -13,9 +13,9 @@
 //! migrations  which steps are done
 //! ```
 //!
-//! Writing is the insertion of one record, acknowledged when a majority of the members has it in its journal; all else
-//! follows beside it (`fold`) or when history is trimmed (`trim`). No process leads. Documents are JSON texts: the database
-//! looks at no key or value of a user's.
+//! Writing is the insertion of one record, acknowledged when a majority of the members has it in
+//! its journal; all else follows beside it (`fold`) or when history is trimmed (`trim`). No process
+//! leads. Documents are JSON texts: the database looks at no key or value of a user's.
 
 mod archive;
 mod client;
@@ -57,8 +57,8 @@ use super::encode::encode_group;
 use super::migrate::{Migrations, Plan};
 use super::upkeep::{Piece, Restored, Rewriter, Upkeep};
 use super::{
-    Archive, AuditEntry, AuditQuery, CommitBatch, CommitError, CommitLog, CommitRecord, IdempotencyRecord, Snapshot,
-    StoreError, TokenRecord, TokenStore, Version,
+    Archive, AuditEntry, AuditQuery, CommitBatch, CommitError, CommitLog, CommitRecord,
+    IdempotencyRecord, Snapshot, StoreError, TokenRecord, TokenStore, Version,
 };
 
 /// Of a record, before one was read.
@@ -75,10 +75,12 @@ pub struct MongoStore {
     doubt: AtomicU64,
     /// What is known of the newest revision.
     fence: parking_lot::Mutex<Fence>,
-    /// When the documents were last brought up to date with the log, or the store was opened; and how long that is left.
+    /// When the documents were last brought up to date with the log, or the store was opened; and
+    /// how long that is left.
     folded: parking_lot::Mutex<Instant>,
     fold_period: Duration,
-    /// The guard's turn when that was last looked at, or after the last step of this process that was in no hurry.
+    /// The guard's turn when that was last looked at, or after the last step of this process that
+    /// was in no hurry.
     turn: parking_lot::Mutex<Option<i64>>,
     /// How large the records were that were read last, on average.
     record_bytes: AtomicI64,
@@ -98,8 +100,8 @@ impl MongoStore {
     /// Connects to the replica set, and migrates the database.
     ///
     /// # Errors
-    /// [`StoreError::Refused`] for a server without transactions, a wrong password, a database of a newer program;
-    /// [`StoreError::Unavailable`] if no primary answers.
+    /// [`StoreError::Refused`] for a server without transactions, a wrong password, a database of a
+    /// newer program; [`StoreError::Unavailable`] if no primary answers.
     pub async fn open(uri: &str, database: &str) -> Result<Self, StoreError> {
         Self::open_with(uri, database, &Migrations::default()).await
     }
@@ -108,23 +110,24 @@ impl MongoStore {
     ///
     /// # Errors
     /// As [`MongoStore::open`].
-    pub async fn open_with(uri: &str, database: &str, migrations: &Migrations) -> Result<Self, StoreError> {
+    pub async fn open_with(
+        uri: &str,
+        database: &str,
+        migrations: &Migrations,
+    ) -> Result<Self, StoreError> {
         let mut store = Self::connect(uri, database).await?;
         store.migrate(migrations).await?;
         store.members = Some(Members::join(&store.tables, &store.writer).await?);
         Ok(store)
     }
 
-    /// Removes records below the floor at once, where others are sure not to be late, and brings the documents up to date at
-    /// each tidying: for tests.
+    /// Removes records below the floor at once, where others are sure not to be late, and brings
+    /// the documents up to date at each tidying: for tests.
     #[doc(hidden)]
     #[must_use]
     pub fn in_a_hurry(self) -> Self {
         *self.fence.lock() = Fence::removing_after(Duration::ZERO);
-        Self {
-            fold_period: Duration::ZERO,
-            ..self
-        }
+        Self { fold_period: Duration::ZERO, ..self }
     }
 
     /// How many records the log has: for tests.
@@ -140,7 +143,11 @@ impl MongoStore {
     ///
     /// # Errors
     /// As [`MongoStore::open`].
-    pub async fn plan(uri: &str, database: &str, migrations: &Migrations) -> Result<Plan, StoreError> {
+    pub async fn plan(
+        uri: &str,
+        database: &str,
+        migrations: &Migrations,
+    ) -> Result<Plan, StoreError> {
         let store = Self::connect(uri, database).await?;
         let plan = store.plan_of(migrations).await;
         store.close().await;
@@ -151,7 +158,11 @@ impl MongoStore {
     ///
     /// # Errors
     /// [`StoreError::Refused`] if it is of another schema than this program's; [`StoreError`].
-    pub async fn export_beside(uri: &str, database: &str, pieces: mpsc::Sender<Piece>) -> Result<(), StoreError> {
+    pub async fn export_beside(
+        uri: &str,
+        database: &str,
+        pieces: mpsc::Sender<Piece>,
+    ) -> Result<(), StoreError> {
         let store = Self::connect(uri, database).await?;
         let plan = store.plan_of(&Migrations::default()).await?;
         let done = match plan.pending.is_empty() {
@@ -166,7 +177,10 @@ impl MongoStore {
     }
 
     /// Reads what other processes reckon with this one to read.
-    async fn as_member<T>(&self, read: impl Future<Output = Result<T, StoreError>>) -> Result<T, StoreError> {
+    async fn as_member<T>(
+        &self,
+        read: impl Future<Output = Result<T, StoreError>>,
+    ) -> Result<T, StoreError> {
         let joined = self.admitted().await?;
         let found = read.await?;
         match self.is_still_admitted(joined) {
@@ -261,15 +275,16 @@ impl CommitLog for MongoStore {
         let rewrites = self.recent.lock().rewrites();
         let done = match self.write_group(&group).await {
             // Another process may have thought that it is alone, and answered reads without this.
-            Ok(()) if !self.is_still_admitted(joined) => Err(CommitError::Unknown(commit::stood_still())),
+            Ok(()) if !self.is_still_admitted(joined) => {
+                Err(CommitError::Unknown(commit::stood_still()))
+            }
             done => done,
         };
         match (&done, group.last()) {
             (Ok(()), _) => self.recent.lock().keep(group, rewrites),
             (Err(CommitError::Unknown(_)), Some(last)) => {
                 // Until these revisions are taken, memory may lack them.
-                self.doubt
-                    .fetch_max(last.event.revision.unsigned_abs(), Ordering::AcqRel);
+                self.doubt.fetch_max(last.event.revision.unsigned_abs(), Ordering::AcqRel);
             }
             (Err(_), _) => {}
         }
@@ -283,11 +298,20 @@ impl CommitLog for MongoStore {
 
 #[async_trait]
 impl Archive for MongoStore {
-    async fn versions(&self, key: &Key, below: Option<u64>, limit: usize) -> Result<Vec<Version>, StoreError> {
+    async fn versions(
+        &self,
+        key: &Key,
+        below: Option<u64>,
+        limit: usize,
+    ) -> Result<Vec<Version>, StoreError> {
         self.read_versions(key, below, limit).await
     }
 
-    async fn documents_at(&self, revision: u64, until: u64) -> Result<Vec<(Key, Option<Config>)>, StoreError> {
+    async fn documents_at(
+        &self,
+        revision: u64,
+        until: u64,
+    ) -> Result<Vec<(Key, Option<Config>)>, StoreError> {
         self.read_documents_at(revision, until).await
     }
 
@@ -311,7 +335,11 @@ impl Archive for MongoStore {
         self.tidy_up().await
     }
 
-    async fn idempotency(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {
+    async fn idempotency(
+        &self,
+        id: &str,
+        now: Timestamp,
+    ) -> Result<Option<IdempotencyRecord>, StoreError> {
         self.read_answer(id, now).await
     }
 }
@@ -322,7 +350,12 @@ impl TokenStore for MongoStore {
         self.write_token(token, audit).await
     }
 
-    async fn revoke_token(&self, id: &str, time: Timestamp, audit: &AuditEntry) -> Result<bool, StoreError> {
+    async fn revoke_token(
+        &self,
+        id: &str,
+        time: Timestamp,
+        audit: &AuditEntry,
+    ) -> Result<bool, StoreError> {
         self.write_revocation(id, time, audit).await
     }
 

@@ -98,22 +98,19 @@ impl MongoStore {
     }
 
     /// Commits after a revision, then the floor.
-    pub(super) async fn read_commits(&self, after: u64, limit: usize) -> Result<CommitBatch, StoreError> {
+    pub(super) async fn read_commits(
+        &self,
+        after: u64,
+        limit: usize,
+    ) -> Result<CommitBatch, StoreError> {
         let asked = since_boot();
-        let part = Part {
-            after: signed(after),
-            records: limit.max(1),
-            bytes: READ_BYTES,
-            whole: false,
-        };
+        let part =
+            Part { after: signed(after), records: limit.max(1), bytes: READ_BYTES, whole: false };
         let (records, all) = self.read_records(part).await?;
         let floor = self.read_floor().await?;
         if floor > after {
             // Some of it may have been removed while it was read.
-            return Ok(CommitBatch {
-                commits: Vec::new(),
-                floor,
-            });
+            return Ok(CommitBatch { commits: Vec::new(), floor });
         }
         if let Some(last) = records.last().filter(|_| all) {
             self.fence.lock().newest_was(last.last, asked, since_boot());
@@ -128,14 +125,11 @@ impl MongoStore {
         shorten(&mut events, limit.max(1));
         let last = events.last().map_or(0, |event| event.revision);
         versions.retain(|version| version.revision <= last);
-        Ok(CommitBatch {
-            commits: decode_commits(after, events, versions)?,
-            floor,
-        })
+        Ok(CommitBatch { commits: decode_commits(after, events, versions)?, floor })
     }
 
-    /// Records with commits after a revision, ascending, as many as may be but at least one; and whether these are all. The
-    /// first one may begin with older commits.
+    /// Records with commits after a revision, ascending, as many as may be but at least one; and
+    /// whether these are all. The first one may begin with older commits.
     pub(super) async fn read_records(&self, part: Part) -> Result<(Vec<Record>, bool), StoreError> {
         let next = doc! { "_id": { "$gt": part.after } };
         let (mut records, all) = self.find_records(next, part).await?;
@@ -158,7 +152,11 @@ impl MongoStore {
         super::collect(self.tables.events.aggregate(pipeline), rows::read_record).await
     }
 
-    async fn find_records(&self, filter: Document, part: Part) -> Result<(Vec<Record>, bool), StoreError> {
+    async fn find_records(
+        &self,
+        filter: Document,
+        part: Part,
+    ) -> Result<(Vec<Record>, bool), StoreError> {
         let mut find = self.tables.events.find(filter).sort(doc! { "_id": 1 });
         find = find.batch_size(batch(part, self.record_bytes.load(Ordering::Relaxed)));
         if !part.whole {
@@ -202,8 +200,9 @@ impl MongoStore {
     }
 }
 
-/// How many records the database shall send at once, if they are as large as those before: otherwise it sends a hundred and
-/// one, or 16 MiB of them, however few are wanted. If they are small after large ones, a few at once still do.
+/// How many records the database shall send at once, if they are as large as those before:
+/// otherwise it sends a hundred and one, or 16 MiB of them, however few are wanted. If they are
+/// small after large ones, a few at once still do.
 fn batch(part: Part, record_bytes: i64) -> u32 {
     let within = usize::try_from(part.bytes / record_bytes.max(1)).unwrap_or(usize::MAX);
     let one_more = within.max(LEAST_BATCH).min(part.records).saturating_add(1);
@@ -212,10 +211,12 @@ fn batch(part: Part, record_bytes: i64) -> u32 {
 
 /// The newest revision that a majority has.
 pub(super) async fn newest(tables: &Tables) -> Result<u64, StoreError> {
-    // An index has all of it: the record itself may be large, and this is asked for by nearly every read. Not the largest
-    // `last`: that may be of a record that came too late, and lies under others.
+    // An index has all of it: the record itself may be large, and this is asked for by nearly every
+    // read. Not the largest `last`: that may be of a record that came too late, and lies under
+    // others.
     let newest = rawdoc! {
-        "find": "events", "filter": {}, "projection": { "_id": 0, "last": 1 }, "sort": { "_id": -1 }, "limit": 1,
+        "find": "events", "filter": {}, "projection": { "_id": 0, "last": 1 },
+        "sort": { "_id": -1 }, "limit": 1,
         "hint": "newest", "singleBatch": true, "readConcern": { "level": "majority" },
     };
     let answer = limited(QUICK, tables.database.run_raw_command(newest)).await?;
@@ -233,7 +234,8 @@ async fn guard(tables: &Tables) -> Result<Guard, StoreError> {
     Guard::read(&found.ok_or_else(|| corrupt("the floor is missing"))?)
 }
 
-/// Puts changes into the records of their commits. A copy of one that is there already changes nothing.
+/// Puts changes into the records of their commits. A copy of one that is there already changes
+/// nothing.
 fn fill(records: &mut [Record], found: Vec<VersionRow>) {
     for version in found {
         let place = records
@@ -244,12 +246,8 @@ fn fill(records: &mut [Record], found: Vec<VersionRow>) {
         }
     }
     for record in records {
-        record
-            .versions
-            .sort_by_key(|version| (version.revision, version.position));
-        record
-            .versions
-            .dedup_by_key(|version| (version.revision, version.position));
+        record.versions.sort_by_key(|version| (version.revision, version.position));
+        record.versions.dedup_by_key(|version| (version.revision, version.position));
     }
 }
 
@@ -271,7 +269,8 @@ pub(super) async fn records_in(
     after: i64,
 ) -> Result<Result<Vec<Record>, StoreError>, Error> {
     let events = plain.collection::<Document>("events");
-    let find = events.find(doc! { "last": { "$gt": after }, "_id": { "$gt": after - RECORD_COMMITS } });
+    let find =
+        events.find(doc! { "last": { "$gt": after }, "_id": { "$gt": after - RECORD_COMMITS } });
     let mut cursor = find.sort(doc! { "_id": 1 }).session(&mut *session).await?;
     let mut records = Vec::new();
     while let Some(found) = cursor.next(&mut *session).await.transpose()? {
@@ -365,12 +364,7 @@ mod tests {
 
     #[test]
     fn the_database_sends_about_as_much_as_is_wanted() {
-        let part = |records, bytes| Part {
-            after: 0,
-            records,
-            bytes,
-            whole: false,
-        };
+        let part = |records, bytes| Part { after: 0, records, bytes, whole: false };
         assert_eq!(batch(part(1_000, 1 << 20), 16 << 10), 65);
         assert_eq!(batch(part(1_000, 1 << 20), 1), 1_001);
         assert_eq!(batch(part(1, 8 << 20), 16 << 10), 2);
@@ -389,14 +383,21 @@ mod tests {
             subject: String::new(),
             request_id: String::new(),
             paths: "[]".to_owned(),
-            document: crate::store::encode::document_text(&crate::store::samples::node("x", 1)).unwrap(),
+            document: crate::store::encode::document_text(&crate::store::samples::node("x", 1))
+                .unwrap(),
         }
     }
 
     #[test]
     fn a_store_without_commits_is_at_its_floor() {
         let meta = doc! { "_id": "store", "store_id": "s" };
-        let floor = doc! { "_id": FLOOR, "floor": 9_i64, "folded": 9_i64, "turn": 0_i64, "rewrites": 0_i64 };
+        let floor = doc! {
+            "_id": FLOOR,
+            "floor": 9_i64,
+            "folded": 9_i64,
+            "turn": 0_i64,
+            "rewrites": 0_i64,
+        };
         let found = parts(Some(&meta), std::slice::from_ref(&floor)).unwrap();
         let found = found.with(Vec::new()).unwrap();
         assert_eq!((found.revision, found.floor, found.documents.len()), (9, 9, 0));
@@ -409,7 +410,13 @@ mod tests {
         let meta = doc! { "_id": "store", "store_id": "s" };
         let text = version("", 0, "").document;
         let found = [
-            doc! { "_id": FLOOR, "floor": 2_i64, "folded": 5_i64, "turn": 0_i64, "rewrites": 0_i64 },
+            doc! {
+                "_id": FLOOR,
+                "floor": 2_i64,
+                "folded": 5_i64,
+                "turn": 0_i64,
+                "rewrites": 0_i64,
+            },
             doc! { "_id": "Node/a", "revision": 5_i64, "document": &text },
             doc! { "_id": "Node/b", "revision": 5_i64, "document": &text },
         ];
@@ -426,22 +433,15 @@ mod tests {
             ..Record::default()
         };
         let found = parts(Some(&meta), &found).unwrap().with(vec![record]).unwrap();
-        let keys: Vec<String> = found
-            .documents
-            .iter()
-            .map(|document| document.key.to_string())
-            .collect();
+        let keys: Vec<String> =
+            found.documents.iter().map(|document| document.key.to_string()).collect();
         assert_eq!(keys, ["Node/b", "Node/d"]);
         assert_eq!((found.revision, found.floor), (8, 2));
     }
 
     #[test]
     fn a_record_under_others_came_too_late() {
-        let record = |(first, last)| Record {
-            first,
-            last,
-            ..Record::default()
-        };
+        let record = |(first, last)| Record { first, last, ..Record::default() };
         for (found, left) in [
             (vec![(1, 2), (3, 3), (4, 9)], vec![1, 3, 4]),
             (vec![(1, 5), (3, 3), (4, 9)], vec![3, 4]),
@@ -468,13 +468,10 @@ mod tests {
         second.position = 1;
         fill(
             &mut records,
-            vec![
-                second.clone(),
-                version("Node/a", 1, "create"),
-                version("Node/a", 2, "update"),
-            ],
+            vec![second.clone(), version("Node/a", 1, "create"), version("Node/a", 2, "update")],
         );
-        let keys: Vec<&str> = records[0].versions.iter().map(|version| version.key.as_str()).collect();
+        let keys: Vec<&str> =
+            records[0].versions.iter().map(|version| version.key.as_str()).collect();
         assert_eq!(keys, ["Node/a", "Node/b", "Node/a"]);
     }
 }

@@ -1,5 +1,6 @@
-//! What this process has written itself, so that bringing the documents up to date need not read it from the log: that
-//! would be much for the database and for this process, while others wait for both.
+//! What this process has written itself, so that bringing the documents up to date need not read it
+//! from the log: that would be much for the database and for this process, while others wait for
+//! both.
 //!
 //! ```text
 //! group, written ──▶ goes on where the one before ended? ── no ──▶ begin anew with it
@@ -8,7 +9,8 @@
 //!                    the last state of each document ── too much ───────┘
 //! ```
 //!
-//! It may lack anything, but never something in the middle: it holds whatever changed above a revision, up to another.
+//! It may lack anything, but never something in the middle: it holds whatever changed above a
+//! revision, up to another.
 
 use super::fold::Gathered;
 use super::rows::Guard;
@@ -16,7 +18,8 @@ use crate::store::encode::EncodedCommit;
 
 #[derive(Debug, Default)]
 pub(super) struct Recent {
-    /// How often the log had been rewritten before the first of these was written; nothing is kept before that is known.
+    /// How often the log had been rewritten before the first of these was written; nothing is kept
+    /// before that is known.
     rewrites: Option<i64>,
     /// Changes above this revision, up to the one of `gathered`.
     after: i64,
@@ -32,7 +35,8 @@ pub(super) struct Written {
 }
 
 impl Recent {
-    /// Forgets what the documents have, and what was written before the log was rewritten for the last time.
+    /// Forgets what the documents have, and what was written before the log was rewritten for the
+    /// last time.
     pub(super) fn look_at(&mut self, guard: Guard) {
         if self.rewrites != Some(guard.rewrites) {
             self.forget();
@@ -60,7 +64,8 @@ impl Recent {
         gathered
     }
 
-    /// How often the log was rewritten, as far as is known: to be noted before something is written.
+    /// How often the log was rewritten, as far as is known: to be noted before something is
+    /// written.
     pub(super) fn rewrites(&self) -> Option<i64> {
         self.rewrites
     }
@@ -77,12 +82,10 @@ impl Recent {
         if first.revision != self.gathered.revision + 1 || self.gathered.is_full() {
             self.begin_after(first.revision - 1);
         }
-        self.last = Some(Written {
-            first: first.revision,
-            batch: first.batch.clone(),
-        });
+        self.last = Some(Written { first: first.revision, batch: first.batch.clone() });
         for mut row in group.into_iter().flat_map(|commit| commit.versions) {
-            // The collection has no paths of changes, and a text that was just serialised has room to spare.
+            // The collection has no paths of changes, and a text that was just serialised has room
+            // to spare.
             row.paths = String::new();
             row.document.shrink_to_fit();
             self.gathered.add(row);
@@ -90,7 +93,8 @@ impl Recent {
         self.gathered.revision = last;
     }
 
-    /// Gives away all that is above the revision of the documents, if there is something and nothing is missing.
+    /// Gives away all that is above the revision of the documents, if there is something and
+    /// nothing is missing.
     pub(super) fn take_above(&mut self, guard: Guard) -> Option<Gathered> {
         self.look_at(guard);
         if self.after > guard.folded || self.gathered.revision <= guard.folded {
@@ -114,12 +118,7 @@ mod tests {
     }
 
     fn guard(folded: i64, rewrites: i64) -> Guard {
-        Guard {
-            floor: 0,
-            folded,
-            turn: 0,
-            rewrites,
-        }
+        Guard { floor: 0, folded, turn: 0, rewrites }
     }
 
     fn recent() -> Recent {
@@ -163,10 +162,7 @@ mod tests {
         keep(&mut recent, group(5..=6, "b"));
         assert_eq!(taken(&mut recent, guard(0, 0)), None, "another process has written 4");
         assert_eq!(taken(&mut recent, guard(3, 0)), None);
-        assert_eq!(
-            taken(&mut recent, guard(4, 0)),
-            Some((6, vec![("Node/b".to_owned(), 6)]))
-        );
+        assert_eq!(taken(&mut recent, guard(4, 0)), Some((6, vec![("Node/b".to_owned(), 6)])));
         assert_eq!(taken(&mut recent, guard(6, 0)), None, "there is nothing new");
     }
 
@@ -175,21 +171,14 @@ mod tests {
         let mut recent = recent();
         keep(&mut recent, group(1..=3, "a"));
         keep(&mut recent, group(4..=6, "b"));
-        assert_eq!(
-            taken(&mut recent, guard(3, 0)),
-            Some((6, vec![("Node/b".to_owned(), 6)]))
-        );
+        assert_eq!(taken(&mut recent, guard(3, 0)), Some((6, vec![("Node/b".to_owned(), 6)])));
     }
 
     #[test]
     fn what_was_written_before_the_log_was_rewritten_is_forgotten() {
         let mut recent = Recent::default();
         keep(&mut recent, group(1..=1, "a"));
-        assert_eq!(
-            taken(&mut recent, guard(0, 0)),
-            None,
-            "the log may have been rewritten since"
-        );
+        assert_eq!(taken(&mut recent, guard(0, 0)), None, "the log may have been rewritten since");
         keep(&mut recent, group(2..=2, "a"));
         assert_eq!(taken(&mut recent, guard(1, 1)), None);
         let before = recent.rewrites();
@@ -212,18 +201,11 @@ mod tests {
         let last = recent.last().unwrap();
         assert_eq!(last.first, 4);
         recent.look_at(guard(4, 0));
-        assert_eq!(
-            (recent.gathered.len(), recent.last()),
-            (2, Some(last)),
-            "5 is not there yet"
-        );
+        assert_eq!((recent.gathered.len(), recent.last()), (2, Some(last)), "5 is not there yet");
         recent.look_at(guard(5, 0));
         assert_eq!((recent.gathered.len(), recent.last()), (0, None));
         keep(&mut recent, group(6..=6, "a"));
-        assert_eq!(
-            taken(&mut recent, guard(5, 0)),
-            Some((6, vec![("Node/a".to_owned(), 6)]))
-        );
+        assert_eq!(taken(&mut recent, guard(5, 0)), Some((6, vec![("Node/a".to_owned(), 6)])));
     }
 
     #[test]

@@ -9,8 +9,8 @@ use crate::store::StoreError;
 use crate::store::encode::{EncodedCommit, corrupt};
 use crate::store::rows::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenRow, VersionRow};
 
-/// `_id` of the record in `documents` that holds the floor, and how far the documents have come. Keys of documents begin
-/// with a capital letter.
+/// `_id` of the record in `documents` that holds the floor, and how far the documents have come.
+/// Keys of documents begin with a capital letter.
 pub(super) const FLOOR: &str = "floor";
 
 /// What the record [`FLOOR`] holds.
@@ -43,7 +43,12 @@ impl Guard {
 
     /// The record as long as the floor is this one, and may be raised to another.
     pub(super) fn not_raised(self, floor: i64) -> Document {
-        doc! { "_id": FLOOR, FLOOR: self.floor, "folded": { "$gte": floor }, "rewrites": self.rewrites }
+        doc! {
+            "_id": FLOOR,
+            FLOOR: self.floor,
+            "folded": { "$gte": floor },
+            "rewrites": self.rewrites,
+        }
     }
 }
 
@@ -74,16 +79,15 @@ impl Record {
 
     /// Revisions some of whose changes are in `versions` alone.
     pub(super) fn incomplete(&self) -> impl Iterator<Item = i64> {
-        let inline = |revision: i64| self.versions.iter().filter(move |row| row.revision == revision).count();
-        let lacks = move |event: &&EventRow| i64::try_from(inline(event.revision)) != Ok(event.changes);
+        let inline = |revision: i64| {
+            self.versions.iter().filter(move |row| row.revision == revision).count()
+        };
+        let lacks =
+            move |event: &&EventRow| i64::try_from(inline(event.revision)) != Ok(event.changes);
         // Changes are counted only where a record is large enough to lack some.
         let count: i64 = self.events.iter().map(|event| event.changes).sum();
         let whole = i64::try_from(self.versions.len()) == Ok(count);
-        self.events
-            .iter()
-            .filter(move |_| !whole)
-            .filter(lacks)
-            .map(|event| event.revision)
+        self.events.iter().filter(move |_| !whole).filter(lacks).map(|event| event.revision)
     }
 }
 
@@ -100,10 +104,9 @@ pub(super) fn record(commits: &[EncodedCommit], writer: &str, inline: usize) -> 
         "batch": batch, "writer": writer, "commits": events, "docs": docs,
     };
     let entries = || commits.iter().flat_map(|commit| &commit.audit);
-    if let (Some(oldest), Some(newest)) = (
-        entries().map(|entry| &entry.id).min(),
-        entries().map(|entry| &entry.id).max(),
-    ) {
+    if let (Some(oldest), Some(newest)) =
+        (entries().map(|entry| &entry.id).min(), entries().map(|entry| &entry.id).max())
+    {
         record.insert("audit_first", oldest);
         record.insert("audit_last", newest);
         record.insert("audit", entries().map(audit).collect::<Vec<_>>());
@@ -118,7 +121,8 @@ pub(super) fn record(commits: &[EncodedCommit], writer: &str, inline: usize) -> 
 
 fn event(row: &EventRow, batch: &str) -> Document {
     let mut event = doc! {
-        "time": row.time, "subject": &row.subject, "request_id": &row.request_id, "changes": row.changes,
+        "time": row.time, "subject": &row.subject, "request_id": &row.request_id,
+        "changes": row.changes,
         "bytes": row.bytes,
     };
     if row.batch != batch {
@@ -130,7 +134,8 @@ fn event(row: &EventRow, batch: &str) -> Document {
 fn change(row: &VersionRow) -> Document {
     doc! {
         "key": &row.key, "revision": row.revision, "position": row.position, "op": &row.op,
-        "previous": row.previous.map_or(Bson::Null, Bson::Int64), "paths": &row.paths, "document": &row.document,
+        "previous": row.previous.map_or(Bson::Null, Bson::Int64), "paths": &row.paths,
+        "document": &row.document,
     }
 }
 
@@ -156,9 +161,7 @@ pub(super) fn read_record(found: &Document) -> Result<Record, StoreError> {
         first,
         last: integer(found, "last")?,
         versions: versions.collect::<Result<_, _>>()?,
-        audit: members(found, "audit")
-            .map(|entry| read_audit(entry?))
-            .collect::<Result<_, _>>()?,
+        audit: members(found, "audit").map(|entry| read_audit(entry?)).collect::<Result<_, _>>()?,
         answers: members(found, "answers")
             .map(|answer| read_idempotency(answer?))
             .collect::<Result<_, _>>()?,
@@ -166,12 +169,15 @@ pub(super) fn read_record(found: &Document) -> Result<Record, StoreError> {
     })
 }
 
-fn read_change(first: i64, events: &[EventRow], found: &Document) -> Result<VersionRow, StoreError> {
+fn read_change(
+    first: i64,
+    events: &[EventRow],
+    found: &Document,
+) -> Result<VersionRow, StoreError> {
     let revision = integer(found, "revision")?;
-    let event = usize::try_from(revision - first)
-        .ok()
-        .and_then(|place| events.get(place));
-    let event = event.ok_or_else(|| corrupt(format_args!("commit {revision} is not in its record {first}")))?;
+    let event = usize::try_from(revision - first).ok().and_then(|place| events.get(place));
+    let event = event
+        .ok_or_else(|| corrupt(format_args!("commit {revision} is not in its record {first}")))?;
     Ok(VersionRow {
         key: text(found, "key")?,
         revision,
@@ -193,9 +199,7 @@ pub(super) fn members<'a>(
 ) -> impl Iterator<Item = Result<&'a Document, StoreError>> + use<'a> {
     let all = found.get_array(name).map(Vec::as_slice).unwrap_or_default();
     all.iter().map(|member| {
-        member
-            .as_document()
-            .ok_or_else(|| corrupt("a record holds what is no document"))
+        member.as_document().ok_or_else(|| corrupt("a record holds what is no document"))
     })
 }
 
@@ -207,7 +211,8 @@ pub(super) fn version_id(key: &str, revision: i64) -> String {
 /// Key and revision of an `_id`.
 pub(super) fn split_version_id(id: &str) -> Result<(&str, i64), StoreError> {
     let parts = id.rsplit_once('@');
-    let parts = parts.and_then(|(key, revision)| Some((key, i64::from_str_radix(revision, 16).ok()?)));
+    let parts =
+        parts.and_then(|(key, revision)| Some((key, i64::from_str_radix(revision, 16).ok()?)));
     parts.ok_or_else(|| corrupt(format_args!("{id:?} names no version")))
 }
 
@@ -218,8 +223,10 @@ pub(super) fn versions_below(key: &str, below: i64) -> Document {
 
 pub(super) fn version(row: &VersionRow) -> Document {
     doc! {
-        "_id": version_id(&row.key, row.revision), "revision": row.revision, "position": row.position, "op": &row.op,
-        "previous": row.previous.map_or(Bson::Null, Bson::Int64), "time": row.time, "subject": &row.subject,
+        "_id": version_id(&row.key, row.revision), "revision": row.revision,
+        "position": row.position, "op": &row.op,
+        "previous": row.previous.map_or(Bson::Null, Bson::Int64), "time": row.time,
+        "subject": &row.subject,
         "request_id": &row.request_id, "paths": &row.paths, "document": &row.document,
     }
 }
@@ -228,10 +235,7 @@ pub(super) fn read_version(found: &Document) -> Result<VersionRow, StoreError> {
     let id = text(found, "_id")?;
     let (key, _) = split_version_id(&id)?;
     let row: VersionRow = read(found, "key")?;
-    Ok(VersionRow {
-        key: key.to_owned(),
-        ..row
-    })
+    Ok(VersionRow { key: key.to_owned(), ..row })
 }
 
 /// A row whose members are those of the document; its `_id` is called otherwise in the row.
@@ -258,9 +262,11 @@ pub(super) fn read_document(found: &Document) -> Result<DocumentRow, StoreError>
 pub(super) fn audit(row: &AuditRow) -> Document {
     doc! {
         "_id": &row.id, "time": DateTime::from_millis(row.time),
-        "revision": row.revision.map_or(Bson::Null, Bson::Int64), "subject": &row.subject, "roles": &row.roles,
+        "revision": row.revision.map_or(Bson::Null, Bson::Int64), "subject": &row.subject,
+        "roles": &row.roles,
         "action": &row.action, "kind": optional(&row.kind), "service": optional(&row.service),
-        "name": optional(&row.name), "allowed": row.allowed, "code": optional(&row.code), "paths": &row.paths,
+        "name": optional(&row.name), "allowed": row.allowed, "code": optional(&row.code),
+        "paths": &row.paths,
         "request_id": &row.request_id, "address": &row.address, "detail": optional(&row.detail),
     }
 }
@@ -271,7 +277,8 @@ pub(super) fn read_audit(found: &Document) -> Result<AuditRow, StoreError> {
 
 pub(super) fn idempotency(row: &IdempotencyRow) -> Document {
     doc! {
-        "_id": &row.id, "body": &row.body, "expires": DateTime::from_millis(row.expires), "revision": row.revision,
+        "_id": &row.id, "body": &row.body, "expires": DateTime::from_millis(row.expires),
+        "revision": row.revision,
         "answer": &row.answer,
     }
 }
@@ -341,10 +348,7 @@ mod tests {
         let found = read_record(&super::record(&group, "me", usize::MAX)).unwrap();
         assert_eq!((found.first, found.last), (7, 8));
         assert_eq!(found.events, [group[0].event.clone(), group[1].event.clone()]);
-        assert_eq!(
-            found.versions,
-            [group[0].versions.clone(), group[1].versions.clone()].concat()
-        );
+        assert_eq!(found.versions, [group[0].versions.clone(), group[1].versions.clone()].concat());
         assert_eq!(found.audit, [group[0].audit.clone(), group[1].audit.clone()].concat());
         assert_eq!(found.answers, [group[0].idempotency.clone().unwrap()]);
         assert_eq!(found.incomplete().count(), 0);
@@ -367,7 +371,9 @@ mod tests {
     fn versions_of_one_key_are_together_and_in_order() {
         let mut ids: Vec<String> = ["Node/a", "Node/a-b", "Node/ab", "Node/a0"]
             .iter()
-            .flat_map(|key| [300, 9, 4_096, 1_000_000_007].map(|revision| version_id(key, revision)))
+            .flat_map(|key| {
+                [300, 9, 4_096, 1_000_000_007].map(|revision| version_id(key, revision))
+            })
             .collect();
         ids.sort();
         let split: Vec<(&str, i64)> = ids.iter().map(|id| split_version_id(id).unwrap()).collect();

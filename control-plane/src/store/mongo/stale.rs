@@ -1,9 +1,10 @@
 //! Transactions whose process has gone.
 //!
-//! A process that is killed within a transaction leaves it open on the server, which ends it only after
-//! `transactionLifetimeLimitSeconds` (60 s). Until then it holds the next revision, and nobody can write. So a writer that
-//! was held up for longer than a live process takes ends those of our transactions that nobody works on. Should one be
-//! of a live process all the same, its next statement fails, and it tries again: nothing but time is lost.
+//! A process that is killed within a transaction leaves it open on the server, which ends it only
+//! after `transactionLifetimeLimitSeconds` (60 s). Until then it holds the next revision, and
+//! nobody can write. So a writer that was held up for longer than a live process takes ends those
+//! of our transactions that nobody works on. Should one be of a live process all the same, its next
+//! statement fails, and it tries again: nothing but time is lost.
 
 use futures::TryStreamExt as _;
 use mongodb::bson::{Bson, Document, doc};
@@ -18,11 +19,14 @@ const IDLE_MICROS: i64 = 300_000;
 /// Ends them. What does not work is told in the log: then the server does it, later.
 pub(super) async fn end_idle_transactions(tables: &Tables) {
     match end(tables).await {
-        Ok(0) => tracing::debug!("another transaction holds the next revision, and is being worked on"),
+        Ok(0) => {
+            tracing::debug!("another transaction holds the next revision, and is being worked on")
+        }
         Ok(count) => tracing::info!(count, "ended transactions of processes that are gone"),
         Err(error) => tracing::warn!(
             %error,
-            "a transaction of another process holds up all writes, and cannot be ended here: the server ends it within 60 s"
+            "a transaction of another process holds up all writes, and cannot be ended here: the \
+             server ends it within 60 s"
         ),
     }
 }
@@ -30,7 +34,8 @@ pub(super) async fn end_idle_transactions(tables: &Tables) {
 async fn end(tables: &Tables) -> Result<usize, StoreError> {
     let pipeline = [
         doc! { "$currentOp": { "allUsers": false, "idleSessions": true } },
-        doc! { "$match": { "type": "idleSession", "transaction.timeInactiveMicros": { "$gte": IDLE_MICROS } } },
+        doc! { "$match": { "type": "idleSession",
+        "transaction.timeInactiveMicros": { "$gte": IDLE_MICROS } } },
     ];
     let admin = tables.admin();
     let sessions = limited_steps(QUICK, async {
@@ -54,7 +59,8 @@ async fn end(tables: &Tables) -> Result<usize, StoreError> {
 fn is_ours(found: &Document, app_name: &str) -> bool {
     let at_top = found.get_str("appName").ok();
     let client = found.get_document("clientMetadata").ok();
-    let within = client.and_then(|client| client.get_document("application").ok()?.get_str("name").ok());
+    let within =
+        client.and_then(|client| client.get_document("application").ok()?.get_str("name").ok());
     at_top == Some(app_name) || within == Some(app_name)
 }
 
@@ -73,10 +79,7 @@ mod tests {
         let ours = doc! { "appName": "blaze-config/x", "lsid": { "id": 7, "uid": 8 } };
         assert!(is_ours(&ours, "blaze-config/x"));
         assert!(!is_ours(&ours, "blaze-config/y"));
-        assert!(is_ours(
-            &doc! { "clientMetadata": { "application": { "name": "a" } } },
-            "a"
-        ));
+        assert!(is_ours(&doc! { "clientMetadata": { "application": { "name": "a" } } }, "a"));
         assert!(!is_ours(&doc! {}, "a"));
         assert_eq!(session_id(&ours), Some(Bson::Document(doc! { "id": 7 })));
     }

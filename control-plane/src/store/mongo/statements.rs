@@ -75,9 +75,11 @@ fn beside(commit: &EncodedCommit) -> usize {
     audit.sum::<usize>() + answer + 2 * OVERHEAD_BYTES
 }
 
-/// Commands that make documents what they are after these changes, of which each is of another document.
+/// Commands that make documents what they are after these changes, of which each is of another
+/// document.
 pub(super) fn document_updates(rows: &[VersionRow]) -> Vec<Document> {
-    let (gone, there): (Vec<&VersionRow>, Vec<&VersionRow>) = rows.iter().partition(|row| row.is_deletion());
+    let (gone, there): (Vec<&VersionRow>, Vec<&VersionRow>) =
+        rows.iter().partition(|row| row.is_deletion());
     let mut commands = Vec::new();
     if !there.is_empty() {
         let update = |row: &&VersionRow| {
@@ -91,7 +93,8 @@ pub(super) fn document_updates(rows: &[VersionRow]) -> Vec<Document> {
     }
     if !gone.is_empty() {
         let gone: Vec<&str> = gone.iter().map(|row| row.key.as_str()).collect();
-        commands.push(doc! { "delete": "documents", "deletes": [{ "q": { "_id": { "$in": gone } }, "limit": 0 }] });
+        commands.push(doc! { "delete": "documents",
+        "deletes": [{ "q": { "_id": { "$in": gone } }, "limit": 0 }] });
     }
     commands
 }
@@ -109,7 +112,8 @@ mod tests {
 
     #[test]
     fn a_group_is_one_record() {
-        let group = encode_group(&[record(commit(4, &["a", "b"])), record(commit(5, &["c"]))]).unwrap();
+        let group =
+            encode_group(&[record(commit(4, &["a", "b"])), record(commit(5, &["c"]))]).unwrap();
         let statements = Statements::of(&group, "me");
         assert_eq!((statements.records.len(), statements.versions.len()), (1, 0));
         let found = rows::read_record(&statements.records[0]).unwrap();
@@ -129,7 +133,10 @@ mod tests {
         assert_eq!(commands[0].get_array("updates").unwrap().len(), 1);
         assert_eq!(
             commands[1],
-            doc! { "delete": "documents", "deletes": [{ "q": { "_id": { "$in": ["Node/b"] } }, "limit": 0 }] }
+            doc! {
+                "delete": "documents",
+                "deletes": [{ "q": { "_id": { "$in": ["Node/b"] } }, "limit": 0 }],
+            }
         );
         assert!(document_updates(&[]).is_empty());
     }
@@ -160,11 +167,8 @@ mod tests {
         ])
         .unwrap();
         let statements = Statements::of(&group, "me");
-        let records: Vec<_> = statements
-            .records
-            .iter()
-            .map(|found| rows::read_record(found).unwrap())
-            .collect();
+        let records: Vec<_> =
+            statements.records.iter().map(|found| rows::read_record(found).unwrap()).collect();
         let ranges: Vec<_> = records.iter().map(|record| (record.first, record.last)).collect();
         assert_eq!(ranges, [(1, 2), (3, 3), (4, 4), (5, 6)]);
         for found in &statements.records {

@@ -1,12 +1,13 @@
-//! Removing what nobody needs any more. What expires by itself (audit, answers, tokens) is removed by the server.
+//! Removing what nobody needs any more. What expires by itself (audit, answers, tokens) is removed
+//! by the server.
 //!
 //! ```text
 //! documents brought to the floor ─▶ step by step, each one transaction: what outlives the log is copied, the floor rises
 //!                                ─▶ versions to spare are removed ─▶ records below the floor are removed, later
 //! ```
 //!
-//! Readers take the log first and what was copied last, so they miss nothing; what is below the floor they take from the
-//! copies alone.
+//! Readers take the log first and what was copied last, so they miss nothing; what is below the
+//! floor they take from the copies alone.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -41,11 +42,7 @@ impl MongoStore {
             self.move_some(guard, wanted, keep).await?;
             guard = self.read_guard().await?;
         }
-        let now = Trimmed {
-            floor: guard.floor,
-            head,
-            keep,
-        };
+        let now = Trimmed { floor: guard.floor, head, keep };
         self.remove_versions(now).await?;
         self.remove_records(guard.floor).await?;
         unsigned(guard.floor)
@@ -53,12 +50,7 @@ impl MongoStore {
 
     /// One step. If another process was faster, it has done nothing.
     async fn move_some(&self, guard: Guard, wanted: i64, keep: u32) -> Result<(), StoreError> {
-        let part = Part {
-            after: guard.floor,
-            records: STEP,
-            bytes: READ_BYTES,
-            whole: true,
-        };
+        let part = Part { after: guard.floor, records: STEP, bytes: READ_BYTES, whole: true };
         let (records, _) = self.read_records(part).await?;
         let floor = records.last().map_or(wanted, |record| record.last.min(wanted));
         let mut commands = vec![advance(guard.not_raised(floor), doc! { rows::FLOOR: floor })];
@@ -75,15 +67,10 @@ impl MongoStore {
             let mut place = above;
             while let Some(next) = self.next_change(place).await?.filter(|next| *next <= until) {
                 let end = until.min(next.saturating_add(PIECE));
-                self.remove_versions_of(self.changed_keys(place, end).await?, now)
-                    .await?;
+                self.remove_versions_of(self.changed_keys(place, end).await?, now).await?;
                 place = end;
                 self.write_note(match (is_anew, number) {
-                    (true, _) => Trimmed {
-                        floor: place.min(now.floor),
-                        head: place,
-                        ..now
-                    },
+                    (true, _) => Trimmed { floor: place.min(now.floor), head: place, ..now },
                     (false, 0) if above == before.floor => Trimmed { floor: place, ..before },
                     (false, _) => Trimmed { head: place, ..now },
                 })
@@ -93,7 +80,11 @@ impl MongoStore {
         self.write_note(now).await
     }
 
-    async fn remove_versions_of(&self, keys: BTreeSet<String>, now: Trimmed) -> Result<(), StoreError> {
+    async fn remove_versions_of(
+        &self,
+        keys: BTreeSet<String>,
+        now: Trimmed,
+    ) -> Result<(), StoreError> {
         let mut doomed = Vec::new();
         for key in keys {
             let gone = to_spare(&self.revisions_of(&key, now).await?, now.floor, now.keep);
@@ -111,7 +102,10 @@ impl MongoStore {
         let kept = kept.sort(doc! { "revision": 1 }).projection(doc! { "revision": 1 });
         let kept = limited(USUAL, kept).await?;
         let kept = kept.map(|found| rows::integer(&found, "revision")).transpose()?;
-        let near = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS) }, "last": { "$gt": above } };
+        let near = doc! {
+            "_id": { "$gt": above.saturating_sub(RECORD_COMMITS) },
+            "last": { "$gt": above },
+        };
         let logged = self.tables.events.find_one(near).sort(doc! { "_id": 1 });
         let logged = limited(USUAL, logged.projection(doc! { "_id": 1 })).await?;
         let logged = logged.map(|found| rows::integer(&found, "_id")).transpose()?;
@@ -119,7 +113,8 @@ impl MongoStore {
         Ok(kept.into_iter().chain(logged).min())
     }
 
-    /// Revisions of the versions of a document, newest first; of those in the log, as many as count.
+    /// Revisions of the versions of a document, newest first; of those in the log, as many as
+    /// count.
     async fn revisions_of(&self, key: &str, now: Trimmed) -> Result<Vec<i64>, StoreError> {
         let find = self
             .tables
@@ -152,7 +147,8 @@ impl MongoStore {
 
     async fn remove_named(&self, ids: Vec<String>) -> Result<(), StoreError> {
         if !ids.is_empty() {
-            limited(USUAL, self.tables.versions.delete_many(doc! { "_id": { "$in": ids } })).await?;
+            limited(USUAL, self.tables.versions.delete_many(doc! { "_id": { "$in": ids } }))
+                .await?;
         }
         Ok(())
     }
@@ -169,20 +165,16 @@ impl MongoStore {
         let find = self.tables.events.find(range).projection(doc! { "docs.key": 1 });
         let logged = collect_within(LONG, find, |found| {
             let docs = rows::members(found, "docs");
-            docs.map(|change| rows::text(change?, "key"))
-                .collect::<Result<Vec<_>, _>>()
+            docs.map(|change| rows::text(change?, "key")).collect::<Result<Vec<_>, _>>()
         });
         keys.extend(logged.await?.into_iter().flatten());
         Ok(keys)
     }
 
     async fn write_note(&self, done: Trimmed) -> Result<(), StoreError> {
-        let note = doc! { "$set": { "floor": done.floor, "head": done.head, "keep": i64::from(done.keep) } };
-        let note = self
-            .tables
-            .meta
-            .update_one(doc! { "_id": "trimmed" }, note)
-            .upsert(true);
+        let note = doc! { "$set": { "floor": done.floor, "head": done.head,
+        "keep": i64::from(done.keep) } };
+        let note = self.tables.meta.update_one(doc! { "_id": "trimmed" }, note).upsert(true);
         limited(USUAL, note).await?;
         Ok(())
     }
@@ -231,7 +223,8 @@ fn copies(records: Vec<Record>, above: i64, until: i64, keep: u32) -> Vec<Docume
     commands
 }
 
-/// The newest of each document: those before them are to spare as soon as these are below the floor.
+/// The newest of each document: those before them are to spare as soon as these are below the
+/// floor.
 fn worth_keeping(versions: &[VersionRow], keep: u32) -> Vec<&VersionRow> {
     let most = usize::try_from(keep).unwrap_or(usize::MAX).max(1);
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();

@@ -16,11 +16,12 @@ use crate::store::StoreError;
 use crate::store::encode::{corrupt, signed};
 use crate::store::rows::DocumentRow;
 use crate::store::upkeep::{
-    BackupHead, BackupRow, Piece, RESTORE_RAISES_BY, Restored, Rewriter, Row, not_empty, not_whole, now, rewritten,
-    send,
+    BackupHead, BackupRow, Piece, RESTORE_RAISES_BY, Restored, Rewriter, Row, not_empty, not_whole,
+    now, rewritten, send,
 };
 
-/// Documents that one step of a rewriting looks at, and rows that one insertion of a restore has at most.
+/// Documents that one step of a rewriting looks at, and rows that one insertion of a restore has at
+/// most.
 const STEP: i64 = 200;
 const ROWS: usize = 1_000;
 /// Bytes of one insertion of a restore.
@@ -40,11 +41,10 @@ impl MongoStore {
             ("versions", |found| rows::read_version(found).map(Row::Version)),
             ("audit", |found| rows::read_audit(found).map(Box::new).map(Row::Audit)),
             ("tokens", |found| rows::read_token(found).map(Row::Token)),
-            ("idempotency", |found| {
-                rows::read_idempotency(found).map(Row::Idempotency)
-            }),
+            ("idempotency", |found| rows::read_idempotency(found).map(Row::Idempotency)),
         ];
-        // A snapshot session brings its read concern; one of the collections would stand in its way.
+        // A snapshot session brings its read concern; one of the collections would stand in its
+        // way.
         let plain = self.tables.client.database(self.tables.database.name());
         let mut session = limited(USUAL, self.tables.client.start_session().snapshot(true)).await?;
         let (head, guard) = read_head(&plain, &mut session).await?;
@@ -75,7 +75,8 @@ impl MongoStore {
         send(pieces, Piece::End).await
     }
 
-    /// Sends what is in the log alone. Gives the documents that changed since those of the table; none for a deleted one.
+    /// Sends what is in the log alone. Gives the documents that changed since those of the table;
+    /// none for a deleted one.
     async fn send_log(
         &self,
         plain: &Database,
@@ -86,7 +87,8 @@ impl MongoStore {
         let row = |row| send(pieces, Piece::Row(BackupRow(row)));
         let mut changed = BTreeMap::new();
         let events = plain.collection::<Document>("events");
-        let above = doc! { "last": { "$gt": guard.floor }, "_id": { "$gt": guard.floor - RECORD_COMMITS } };
+        let above =
+            doc! { "last": { "$gt": guard.floor }, "_id": { "$gt": guard.floor - RECORD_COMMITS } };
         let find = events.find(above).sort(doc! { "_id": 1 });
         let mut cursor = limited(USUAL, async { find.session(&mut *session).await }).await?;
         let mut ahead = read_next(&mut cursor, session).await?;
@@ -107,8 +109,7 @@ impl MongoStore {
                     row(Row::Version(version)).await?;
                 }
             }
-            self.note_rest(plain, session, (lacking, guard.folded), &mut changed)
-                .await?;
+            self.note_rest(plain, session, (lacking, guard.folded), &mut changed).await?;
             for entry in record.audit {
                 row(Row::Audit(Box::new(entry))).await?;
             }
@@ -144,7 +145,10 @@ impl MongoStore {
     }
 
     /// Fills an empty store, which cannot be opened until it is whole.
-    pub(super) async fn receive_all(&self, mut pieces: mpsc::Receiver<Piece>) -> Result<Restored, StoreError> {
+    pub(super) async fn receive_all(
+        &self,
+        mut pieces: mpsc::Receiver<Piece>,
+    ) -> Result<Restored, StoreError> {
         if !self.is_empty().await? {
             return Err(not_empty());
         }
@@ -166,8 +170,10 @@ impl MongoStore {
             revision: head.revision + RESTORE_RAISES_BY,
         };
         self.start_at(signed(restored.revision)).await?;
-        self.mark(doc! { "$set": { "store_id": &restored.store_id }, "$unset": { "restoring": "" } })
-            .await?;
+        self.mark(
+            doc! { "$set": { "store_id": &restored.store_id }, "$unset": { "restoring": "" } },
+        )
+        .await?;
         Ok(restored)
     }
 
@@ -189,9 +195,8 @@ impl MongoStore {
         }
         let tables = &self.tables;
         for table in [&tables.documents, &tables.versions, &tables.tokens] {
-            let any = table
-                .find_one(doc! { "_id": { "$ne": FLOOR } })
-                .projection(doc! { "_id": 1 });
+            let any =
+                table.find_one(doc! { "_id": { "$ne": FLOOR } }).projection(doc! { "_id": 1 });
             if limited(USUAL, any).await?.is_some() {
                 return Ok(false);
             }
@@ -199,9 +204,14 @@ impl MongoStore {
         Ok(true)
     }
 
-    /// Rewrites the log, then documents and versions. A document that is changed meanwhile keeps its change. Whoever has
-    /// read of the log before, and is about to copy it, finds the guard changed, and begins anew.
-    pub(super) async fn rewrite_all(&self, make: Rewriter<'_>, before: BeforeStep<'_>) -> Result<u64, StoreError> {
+    /// Rewrites the log, then documents and versions. A document that is changed meanwhile keeps
+    /// its change. Whoever has read of the log before, and is about to copy it, finds the guard
+    /// changed, and begins anew.
+    pub(super) async fn rewrite_all(
+        &self,
+        make: Rewriter<'_>,
+        before: BeforeStep<'_>,
+    ) -> Result<u64, StoreError> {
         if !self.has_guard().await? {
             // It was never opened, so it has no documents.
             return Ok(0);
@@ -216,7 +226,11 @@ impl MongoStore {
     }
 
     /// Below the floor, too, for as long as it is there.
-    async fn rewrite_log(&self, make: Rewriter<'_>, before: BeforeStep<'_>) -> Result<u64, StoreError> {
+    async fn rewrite_log(
+        &self,
+        make: Rewriter<'_>,
+        before: BeforeStep<'_>,
+    ) -> Result<u64, StoreError> {
         let (mut place, mut replaced) = (i64::MIN, 0);
         loop {
             before().await?;
@@ -234,7 +248,11 @@ impl MongoStore {
         }
     }
 
-    async fn rewrite_record(&self, record: &Document, make: Rewriter<'_>) -> Result<u64, StoreError> {
+    async fn rewrite_record(
+        &self,
+        record: &Document,
+        make: Rewriter<'_>,
+    ) -> Result<u64, StoreError> {
         let (mut old, mut new) = (doc! { "_id": rows::integer(record, "_id")? }, Document::new());
         for (place, change) in rows::members(record, "docs").enumerate() {
             let change = change?;
@@ -280,7 +298,8 @@ impl MongoStore {
             for (id, text) in texts {
                 let key = id.split('@').next().unwrap_or_default();
                 if let Some(new) = rewritten(key, &text, make)? {
-                    updates.push(doc! { "q": { "_id": &id, "document": text }, "u": { "$set": { "document": new } } });
+                    updates.push(doc! { "q": { "_id": &id, "document": text },
+                    "u": { "$set": { "document": new } } });
                 }
             }
             for some in chunks(updates, BYTES) {
@@ -291,7 +310,8 @@ impl MongoStore {
 
     async fn replace(&self, table: &str, updates: Vec<Document>) -> Result<u64, StoreError> {
         let command = doc! {
-            "update": table, "updates": updates, "ordered": false, "writeConcern": { "w": "majority", "j": true },
+            "update": table, "updates": updates, "ordered": false,
+            "writeConcern": { "w": "majority", "j": true },
         };
         let answer = limited(LONG, self.tables.database.run_command(command)).await?;
         match write_error(&answer) {
@@ -329,17 +349,19 @@ fn text_bytes(found: &Document) -> usize {
     sizes.sum::<usize>() + rows::OVERHEAD_BYTES
 }
 
-async fn read_head(plain: &Database, session: &mut ClientSession) -> Result<(BackupHead, Guard), StoreError> {
+async fn read_head(
+    plain: &Database,
+    session: &mut ClientSession,
+) -> Result<(BackupHead, Guard), StoreError> {
     let events = plain.collection::<Document>("events");
-    let newest = events
-        .find_one(doc! {})
-        .sort(doc! { "_id": -1 })
-        .projection(doc! { "last": 1 });
+    let newest = events.find_one(doc! {}).sort(doc! { "_id": -1 }).projection(doc! { "last": 1 });
     let newest = limited(USUAL, newest.session(&mut *session)).await?;
     let floor = plain.collection::<Document>("documents");
-    let floor = limited(USUAL, floor.find_one(doc! { "_id": FLOOR }).session(&mut *session)).await?;
+    let floor =
+        limited(USUAL, floor.find_one(doc! { "_id": FLOOR }).session(&mut *session)).await?;
     let store = plain.collection::<Document>("meta");
-    let store = limited(USUAL, store.find_one(doc! { "_id": "store" }).session(&mut *session)).await?;
+    let store =
+        limited(USUAL, store.find_one(doc! { "_id": "store" }).session(&mut *session)).await?;
     let (Some(floor), Some(store)) = (floor, store) else {
         return Err(corrupt("the floor or the store's identity is missing"));
     };

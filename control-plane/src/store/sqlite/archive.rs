@@ -54,9 +54,7 @@ pub(super) fn documents_at(
     let mut documents = Vec::new();
     for row in found {
         let (key, previous, text) = row.map_err(store_error)?;
-        let key: Key = key
-            .parse()
-            .map_err(|error| corrupt(format_args!("a version: {error}")))?;
+        let key: Key = key.parse().map_err(|error| corrupt(format_args!("a version: {error}")))?;
         if previous.is_some() && text.is_none() && revision >= floor {
             return Err(corrupt(format_args!(
                 "{key} of revision {previous:?} is missing from its history"
@@ -80,7 +78,10 @@ pub(super) fn revision_before(connection: &Connection, time: Timestamp) -> Resul
     unsigned(found.unwrap_or(0))
 }
 
-pub(super) fn append_audit(connection: &mut Connection, entries: &[AuditRow]) -> Result<(), StoreError> {
+pub(super) fn append_audit(
+    connection: &mut Connection,
+    entries: &[AuditRow],
+) -> Result<(), StoreError> {
     let transaction = connection
         .transaction_with_behavior(TransactionBehavior::Immediate)
         .map_err(store_error)?;
@@ -96,13 +97,14 @@ fn insert_audit(connection: &Connection, entries: &[AuditRow]) -> Result<(), Sto
     Ok(())
 }
 
-pub(super) fn audit(connection: &Connection, query: &AuditQuery) -> Result<Vec<AuditEntry>, StoreError> {
+pub(super) fn audit(
+    connection: &Connection,
+    query: &AuditQuery,
+) -> Result<Vec<AuditEntry>, StoreError> {
     let mut conditions = vec!["1"];
     let mut values: Vec<&dyn ToSql> = Vec::new();
-    let (since, until) = (
-        query.since.map(Timestamp::as_millis),
-        query.until.map(Timestamp::as_millis),
-    );
+    let (since, until) =
+        (query.since.map(Timestamp::as_millis), query.until.map(Timestamp::as_millis));
     for (condition, value) in [
         ("subject = ?", query.subject.as_ref().map(|value| value as &dyn ToSql)),
         ("kind = ?", query.kind.as_ref().map(|value| value as &dyn ToSql)),
@@ -126,9 +128,7 @@ pub(super) fn audit(connection: &Connection, query: &AuditQuery) -> Result<Vec<A
         conditions.join(" AND ")
     );
     let mut statement = connection.prepare(&sql).map_err(store_error)?;
-    let found = statement
-        .query_map(params_from_iter(values), rows::audit)
-        .map_err(store_error)?;
+    let found = statement.query_map(params_from_iter(values), rows::audit).map_err(store_error)?;
     found.map(|row| row.map_err(store_error)?.decode()).collect()
 }
 
@@ -137,10 +137,8 @@ pub(super) fn idempotency(
     id: &str,
     now: Timestamp,
 ) -> Result<Option<IdempotencyRecord>, StoreError> {
-    let sql = format!(
-        "SELECT {} FROM idempotency WHERE id = ?1 AND expires > ?2",
-        rows::IDEMPOTENCY
-    );
+    let sql =
+        format!("SELECT {} FROM idempotency WHERE id = ?1 AND expires > ?2", rows::IDEMPOTENCY);
     let found = connection
         .query_row(&sql, (id, now.as_millis()), rows::idempotency)
         .optional()
@@ -148,7 +146,11 @@ pub(super) fn idempotency(
     found.map(IdempotencyRow::decode).transpose()
 }
 
-pub(super) fn add_token(connection: &mut Connection, token: &TokenRow, audit: &AuditRow) -> Result<(), StoreError> {
+pub(super) fn add_token(
+    connection: &mut Connection,
+    token: &TokenRow,
+    audit: &AuditRow,
+) -> Result<(), StoreError> {
     let transaction = connection
         .transaction_with_behavior(TransactionBehavior::Immediate)
         .map_err(store_error)?;
@@ -183,15 +185,16 @@ pub(super) fn revoke_token(
     Ok(true)
 }
 
-pub(super) fn tokens(connection: &Connection, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {
+pub(super) fn tokens(
+    connection: &Connection,
+    now: Timestamp,
+) -> Result<Vec<TokenRecord>, StoreError> {
     let sql = format!(
         "SELECT {} FROM tokens WHERE expire_time > ?1 ORDER BY create_time DESC, id DESC",
         rows::TOKEN
     );
     let mut statement = connection.prepare(&sql).map_err(store_error)?;
-    let found = statement
-        .query_map([now.as_millis()], rows::token)
-        .map_err(store_error)?;
+    let found = statement.query_map([now.as_millis()], rows::token).map_err(store_error)?;
     found.map(|row| row.map_err(store_error)?.decode()).collect()
 }
 

@@ -10,7 +10,10 @@ use crate::store::rows::EventRow;
 use crate::store::{CommitBatch, CommitError, READ_BYTES, Snapshot, StoreError};
 
 /// Writes a group in one transaction, synced to the disk before it returns.
-pub(super) fn commit(connection: &mut Connection, group: &[EncodedCommit]) -> Result<(), CommitError> {
+pub(super) fn commit(
+    connection: &mut Connection,
+    group: &[EncodedCommit],
+) -> Result<(), CommitError> {
     let Some(first) = group.first().map(|commit| &commit.event) else {
         return Ok(());
     };
@@ -24,9 +27,11 @@ pub(super) fn commit(connection: &mut Connection, group: &[EncodedCommit]) -> Re
     insert(&transaction, group)?;
     match transaction.commit() {
         Ok(()) => Ok(()),
-        // The log may hold the whole transaction although it was not acknowledged, and recovery after a crash would take
-        // it for true.
-        Err(error) if error.sqlite_error_code() == Some(ErrorCode::SystemIoFailure) => settle(connection, first, error),
+        // The log may hold the whole transaction although it was not acknowledged, and recovery
+        // after a crash would take it for true.
+        Err(error) if error.sqlite_error_code() == Some(ErrorCode::SystemIoFailure) => {
+            settle(connection, first, error)
+        }
         Err(error) => Err(not_written(error)),
     }
 }
@@ -51,9 +56,8 @@ fn insert(transaction: &Transaction<'_>, group: &[EncodedCommit]) -> Result<(), 
         }
     }
     let mut put = transaction.prepare(rows::PUT_DOCUMENT).map_err(not_written)?;
-    let mut delete = transaction
-        .prepare("DELETE FROM documents WHERE key = ?1")
-        .map_err(not_written)?;
+    let mut delete =
+        transaction.prepare("DELETE FROM documents WHERE key = ?1").map_err(not_written)?;
     for (key, row) in last_versions(group.iter().flat_map(|commit| &commit.versions)) {
         let done = match row.is_deletion() {
             true => delete.execute([key]),
@@ -64,9 +68,13 @@ fn insert(transaction: &Transaction<'_>, group: &[EncodedCommit]) -> Result<(), 
     Ok(())
 }
 
-/// Finds out what became of a transaction whose end failed. A further transaction that succeeds stands in the log where
-/// the failed one did, or behind it: then what can be read is what is true.
-fn settle(connection: &mut Connection, first: &EventRow, error: rusqlite::Error) -> Result<(), CommitError> {
+/// Finds out what became of a transaction whose end failed. A further transaction that succeeds
+/// stands in the log where the failed one did, or behind it: then what can be read is what is true.
+fn settle(
+    connection: &mut Connection,
+    first: &EventRow,
+    error: rusqlite::Error,
+) -> Result<(), CommitError> {
     match batch_for_certain(connection, first.revision) {
         Ok(Some(batch)) if batch == first.batch => Ok(()),
         Ok(Some(_)) => Err(CommitError::Conflict),
@@ -75,13 +83,14 @@ fn settle(connection: &mut Connection, first: &EventRow, error: rusqlite::Error)
     }
 }
 
-fn batch_for_certain(connection: &mut Connection, revision: i64) -> rusqlite::Result<Option<String>> {
+fn batch_for_certain(
+    connection: &mut Connection,
+    revision: i64,
+) -> rusqlite::Result<Option<String>> {
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     transaction.execute("UPDATE meta SET value = value + 1 WHERE name = 'settled'", [])?;
     let batch = transaction
-        .query_row("SELECT batch FROM events WHERE revision = ?1", [revision], |row| {
-            row.get(0)
-        })
+        .query_row("SELECT batch FROM events WHERE revision = ?1", [revision], |row| row.get(0))
         .optional()?;
     transaction.commit()?;
     Ok(batch)
@@ -115,30 +124,28 @@ pub(super) fn commits_after(
     let transaction = connection.transaction().map_err(store_error)?;
     let floor = unsigned(number(&transaction, "floor")?)?;
     if floor > revision {
-        return Ok(CommitBatch {
-            commits: Vec::new(),
-            floor,
-        });
+        return Ok(CommitBatch { commits: Vec::new(), floor });
     }
     let events = events(&transaction, signed(revision), limit)?;
     let last = events.last().map_or(signed(revision), |event| event.revision);
     let sql = format!(
-        "SELECT {} FROM versions WHERE revision > ?1 AND revision <= ?2 ORDER BY revision, position",
+        "SELECT {} FROM versions WHERE revision > ?1 AND revision <= ?2 ORDER BY revision, \
+         position",
         rows::VERSION
     );
     let mut statement = transaction.prepare(&sql).map_err(store_error)?;
-    let found = statement
-        .query_map([signed(revision), last], rows::version)
-        .map_err(store_error)?;
+    let found =
+        statement.query_map([signed(revision), last], rows::version).map_err(store_error)?;
     let versions = found.collect::<Result<_, _>>().map_err(store_error)?;
-    Ok(CommitBatch {
-        commits: decode_commits(revision, events, versions)?,
-        floor,
-    })
+    Ok(CommitBatch { commits: decode_commits(revision, events, versions)?, floor })
 }
 
 /// As many as `limit` and [`READ_BYTES`] allow, at least one.
-fn events(transaction: &Transaction<'_>, after: i64, limit: usize) -> Result<Vec<EventRow>, StoreError> {
+fn events(
+    transaction: &Transaction<'_>,
+    after: i64,
+    limit: usize,
+) -> Result<Vec<EventRow>, StoreError> {
     let sql = format!(
         "SELECT {} FROM events WHERE revision > ?1 ORDER BY revision LIMIT ?2",
         rows::EVENT

@@ -17,8 +17,8 @@ const APPLICATION_ID: i64 = 0x424C_4346;
 const BUSY: Duration = Duration::from_secs(5);
 /// The log beside the file is cut to this after it was copied into the file.
 const LOG_BYTES: i64 = 64 * 1024 * 1024;
-/// Pages of the log from which a commit copies it itself: where copying beside it does not come to an end, because there is
-/// always one more. 64 MiB.
+/// Pages of the log from which a commit copies it itself: where copying beside it does not come to
+/// an end, because there is always one more. 64 MiB.
 const LOG_PAGES: i64 = 16 * 1024;
 
 /// The path without links and relative parts, so that one file has one lock.
@@ -41,12 +41,14 @@ pub(super) fn real_path(path: &Path) -> Result<PathBuf, StoreError> {
     }
 }
 
-/// What a file that cannot be opened means: [`StoreError::Refused`] where waiting does not help, as without its folder.
+/// What a file that cannot be opened means: [`StoreError::Refused`] where waiting does not help, as
+/// without its folder.
 pub(super) fn file_error(path: &Path, what: &str, error: &std::io::Error) -> StoreError {
     let text = format!("{} {what}: {error}", path.display());
     match error.kind() {
         ErrorKind::NotFound => StoreError::Refused(format!(
-            "{text}: its folder must be there; make or mount it, or name another file in `control_plane.store.sqlite.path`"
+            "{text}: its folder must be there; make or mount it, or name another file in \
+             `control_plane.store.sqlite.path`"
         )),
         ErrorKind::PermissionDenied
         | ErrorKind::NotADirectory
@@ -54,7 +56,8 @@ pub(super) fn file_error(path: &Path, what: &str, error: &std::io::Error) -> Sto
         | ErrorKind::ReadOnlyFilesystem
         | ErrorKind::InvalidInput
         | ErrorKind::InvalidFilename => StoreError::Refused(format!(
-            "{text}: this user must be able to write the file and its folder, or name another file in \
+            "{text}: this user must be able to write the file and its folder, or name another file \
+             in \
              `control_plane.store.sqlite.path`"
         )),
         _ => StoreError::Unavailable(text),
@@ -64,7 +67,8 @@ pub(super) fn file_error(path: &Path, what: &str, error: &std::io::Error) -> Sto
 /// The connection that writes. The file is made if it is not there, readable by its owner alone.
 ///
 /// # Errors
-/// [`StoreError::Refused`] for a file of another program, [`StoreError::Unavailable`], [`StoreError::Corrupt`].
+/// [`StoreError::Refused`] for a file of another program, [`StoreError::Unavailable`],
+/// [`StoreError::Corrupt`].
 pub(super) fn open_writer(path: &Path) -> Result<Connection, StoreError> {
     let mut options = OpenOptions::new();
     options.read(true).write(true).create(true).truncate(false).mode(0o600);
@@ -77,7 +81,8 @@ pub(super) fn open_writer(path: &Path) -> Result<Connection, StoreError> {
         .map_err(store_error)?;
     if !mode.eq_ignore_ascii_case("wal") {
         return Err(StoreError::Refused(format!(
-            "{} is on a file system without shared memory, which SQLite's write-ahead log needs: put it on a local disk",
+            "{} is on a file system without shared memory, which SQLite's write-ahead log needs: \
+             put it on a local disk",
             path.display()
         )));
     }
@@ -105,15 +110,13 @@ pub(super) fn open_copier(path: &Path) -> Result<Connection, StoreError> {
     Ok(connection)
 }
 
-/// Copies as much of the log into the file as nobody reads, without holding up writers. A writer begins it anew when all of
-/// it was copied.
+/// Copies as much of the log into the file as nobody reads, without holding up writers. A writer
+/// begins it anew when all of it was copied.
 ///
 /// # Errors
 /// [`StoreError`]; what was committed is safe in the log.
 pub(super) fn copy_log(connection: &Connection) -> Result<(), StoreError> {
-    connection
-        .query_row("PRAGMA wal_checkpoint(PASSIVE)", [], |_| Ok(()))
-        .map_err(store_error)
+    connection.query_row("PRAGMA wal_checkpoint(PASSIVE)", [], |_| Ok(())).map_err(store_error)
 }
 
 /// A store that is gone with its connection.
@@ -150,14 +153,16 @@ fn check_owner(connection: &Connection, path: &Path) -> Result<(), StoreError> {
         return Ok(());
     }
     Err(StoreError::Refused(format!(
-        "{} is a database of another program: name another file in `control_plane.store.sqlite.path`",
+        "{} is a database of another program: name another file in \
+         `control_plane.store.sqlite.path`",
         path.display()
     )))
 }
 
 fn prepare(connection: &Connection) -> Result<(), StoreError> {
-    let set =
-        |name: &str, value: &dyn rusqlite::ToSql| connection.pragma_update(None, name, value).map_err(store_error);
+    let set = |name: &str, value: &dyn rusqlite::ToSql| {
+        connection.pragma_update(None, name, value).map_err(store_error)
+    };
     set("synchronous", &"FULL")?;
     set("temp_store", &"MEMORY")?;
     set("trusted_schema", &"OFF")?;
@@ -184,15 +189,10 @@ pub(super) fn bootstrap(connection: &mut Connection) -> Result<(), StoreError> {
         .transaction_with_behavior(TransactionBehavior::Immediate)
         .map_err(store_error)?;
     transaction.execute_batch(TABLES).map_err(store_error)?;
-    transaction
-        .pragma_update(None, "application_id", APPLICATION_ID)
-        .map_err(store_error)?;
+    transaction.pragma_update(None, "application_id", APPLICATION_ID).map_err(store_error)?;
     for (name, value) in [("floor", 0), ("min_version", 0), ("settled", 0)] {
         transaction
-            .execute(
-                "INSERT OR IGNORE INTO meta (name, value) VALUES (?1, ?2)",
-                (name, value),
-            )
+            .execute("INSERT OR IGNORE INTO meta (name, value) VALUES (?1, ?2)", (name, value))
             .map_err(store_error)?;
     }
     transaction
@@ -214,10 +214,15 @@ pub(super) fn number(connection: &Connection, name: &str) -> Result<i64, StoreEr
 }
 
 /// Sets a number of `meta`.
-pub(super) fn set_number(connection: &Connection, name: &str, value: i64) -> Result<(), StoreError> {
+pub(super) fn set_number(
+    connection: &Connection,
+    name: &str,
+    value: i64,
+) -> Result<(), StoreError> {
     connection
         .execute(
-            "INSERT INTO meta (name, value) VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = excluded.value",
+            "INSERT INTO meta (name, value) VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value \
+             = excluded.value",
             (name, value),
         )
         .map_err(store_error)?;

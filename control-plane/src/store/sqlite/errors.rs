@@ -10,8 +10,12 @@ pub(super) fn store_error(error: rusqlite::Error) -> StoreError {
     use rusqlite::Error as E;
     match &error {
         E::SqliteFailure(failure, _) => match failure.code {
-            ErrorCode::DatabaseCorrupt | ErrorCode::NotADatabase => StoreError::Corrupt(error.to_string()),
-            ErrorCode::DiskFull => StoreError::Unavailable(format!("{error}: free space on the disk of the store")),
+            ErrorCode::DatabaseCorrupt | ErrorCode::NotADatabase => {
+                StoreError::Corrupt(error.to_string())
+            }
+            ErrorCode::DiskFull => {
+                StoreError::Unavailable(format!("{error}: free space on the disk of the store"))
+            }
             ErrorCode::ReadOnly => StoreError::Unavailable(format!(
                 "{error}: the file and its folder must be writable by this user"
             )),

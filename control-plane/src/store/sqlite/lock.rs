@@ -12,8 +12,8 @@ use rustix::io::Errno;
 use super::connection::file_error;
 use crate::store::StoreError;
 
-/// How long the one before has to let go of it. A process that this one is just starting has a copy of all open files until its
-/// program begins, and the lock with them.
+/// How long the one before has to let go of it. A process that this one is just starting has a copy
+/// of all open files until its program begins, and the lock with them.
 const LET_GO: Duration = Duration::from_millis(250);
 /// Between two tries.
 const AGAIN: Duration = Duration::from_millis(10);
@@ -25,7 +25,8 @@ pub(super) struct FileLock {
 }
 
 impl FileLock {
-    /// Locks `<path>.lock`, and writes the process id into it for people. Blocks for a moment where another one has it.
+    /// Locks `<path>.lock`, and writes the process id into it for people. Blocks for a moment where
+    /// another one has it.
     ///
     /// # Errors
     /// [`StoreError::Refused`] if another process has it, and as [`file_error`].
@@ -68,7 +69,8 @@ fn in_use(path: &Path, file: &mut File) -> StoreError {
         id => format!("process {id}"),
     };
     StoreError::Refused(format!(
-        "{} is used by {by}; one process per SQLite file: stop it, or use `control_plane.store.mongodb` for several",
+        "{} is used by {by}; one process per SQLite file: stop it, or use \
+         `control_plane.store.mongodb` for several",
         path.display()
     ))
 }
@@ -84,9 +86,7 @@ mod tests {
         let first = FileLock::take(&path).unwrap();
         // A lock belongs to the open file, so the same process is refused as another would be.
         let error = FileLock::take(&path).unwrap_err();
-        let StoreError::Refused(text) = error else {
-            panic!("{error}")
-        };
+        let StoreError::Refused(text) = error else { panic!("{error}") };
         assert!(text.contains(&format!("process {}", std::process::id())), "{text}");
         assert!(text.contains("mongodb"), "{text}");
         drop(first);
@@ -111,9 +111,6 @@ mod tests {
     #[test]
     fn a_folder_that_is_not_there_is_named() {
         let error = FileLock::take(Path::new("/nonexistent/blaze/store.db")).unwrap_err();
-        assert!(
-            error.to_string().contains("/nonexistent/blaze/store.db.lock"),
-            "{error}"
-        );
+        assert!(error.to_string().contains("/nonexistent/blaze/store.db.lock"), "{error}");
     }
 }

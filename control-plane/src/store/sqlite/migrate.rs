@@ -55,9 +55,7 @@ impl Target for SqliteStore {
 /// What was done; nothing in a file that is new.
 fn state(connection: &Connection) -> Result<(Vec<Done>, u32), StoreError> {
     let there: Option<i64> = connection
-        .query_row("SELECT 1 FROM sqlite_schema WHERE name = 'migrations'", [], |row| {
-            row.get(0)
-        })
+        .query_row("SELECT 1 FROM sqlite_schema WHERE name = 'migrations'", [], |row| row.get(0))
         .optional()
         .map_err(store_error)?;
     if there.is_none() {
@@ -84,7 +82,8 @@ fn state(connection: &Connection) -> Result<(Vec<Done>, u32), StoreError> {
 fn record(connection: &Connection, done: &Done) -> Result<(), StoreError> {
     connection
         .execute(
-            "INSERT INTO migrations (number, step, name, checksum, time) VALUES (?1, ?2, ?3, ?4, ?5)",
+            "INSERT INTO migrations (number, step, name, checksum, time) VALUES (?1, ?2, ?3, ?4, \
+             ?5)",
             (done.number, done.step, &done.name, &done.checksum, now().as_millis()),
         )
         .map_err(store_error)?;
@@ -114,7 +113,10 @@ impl Target for Looked {
 }
 
 /// What a migration of the file behind this connection would do.
-pub(super) async fn look(connection: Connection, migrations: &Migrations) -> Result<Plan, StoreError> {
+pub(super) async fn look(
+    connection: Connection,
+    migrations: &Migrations,
+) -> Result<Plan, StoreError> {
     let (done, min_version) = state(&connection)?;
     drop(connection);
     plan(&Looked(done, min_version), migrations).await

@@ -8,8 +8,8 @@
 //! <path>       the database        <path>.lock   held by the process that uses it
 //! ```
 //!
-//! A transaction is on the disk before it is acknowledged. A full or read-only disk is an error of the write, and the
-//! store goes on when there is room again.
+//! A transaction is on the disk before it is acknowledged. A full or read-only disk is an error of
+//! the write, and the store goes on when there is room again.
 
 mod archive;
 mod commit;
@@ -40,14 +40,15 @@ use super::migrate::{Migrations, Plan, apply};
 use super::rows::{AuditRow, TokenRow};
 use super::upkeep::{Piece, Restored, Rewriter, Upkeep, now, rewritten};
 use super::{
-    Archive, AuditEntry, AuditQuery, CommitBatch, CommitError, CommitLog, CommitRecord, IdempotencyRecord, Snapshot,
-    StoreError, TokenRecord, TokenStore, Version,
+    Archive, AuditEntry, AuditQuery, CommitBatch, CommitError, CommitLog, CommitRecord,
+    IdempotencyRecord, Snapshot, StoreError, TokenRecord, TokenStore, Version,
 };
 
 /// Documents that one step of a rewriting or trimming looks at.
 const STEP: usize = 200;
 
-/// A store in a file, or in memory. Dropped or closed, its threads end and the file is free for another process.
+/// A store in a file, or in memory. Dropped or closed, its threads end and the file is free for
+/// another process.
 pub struct SqliteStore {
     /// None in memory, where there is only one connection.
     beside: Option<Beside>,
@@ -71,8 +72,9 @@ impl SqliteStore {
     /// Opens the file, makes it if it is not there, and migrates it.
     ///
     /// # Errors
-    /// [`StoreError::Refused`] if another process has it, it is of a newer program or of another one, or its folder is
-    /// not there or not for this user; [`StoreError::Unavailable`] if it cannot be read and written.
+    /// [`StoreError::Refused`] if another process has it, it is of a newer program or of another
+    /// one, or its folder is not there or not for this user; [`StoreError::Unavailable`] if it
+    /// cannot be read and written.
     pub async fn open(path: &Path, supervisor: &Supervisor) -> Result<Self, StoreError> {
         Self::open_with(path, &Migrations::default(), supervisor).await
     }
@@ -81,23 +83,29 @@ impl SqliteStore {
     ///
     /// # Errors
     /// As [`SqliteStore::open`].
-    pub async fn open_with(path: &Path, migrations: &Migrations, supervisor: &Supervisor) -> Result<Self, StoreError> {
+    pub async fn open_with(
+        path: &Path,
+        migrations: &Migrations,
+        supervisor: &Supervisor,
+    ) -> Result<Self, StoreError> {
         let path = connection::real_path(path)?;
         let lock = FileLock::take(&path)?;
-        let writer = Worker::start("sqlite-writer", connection::open_writer(&path)?, Some(lock), supervisor)?;
+        let writer = Worker::start(
+            "sqlite-writer",
+            connection::open_writer(&path)?,
+            Some(lock),
+            supervisor,
+        )?;
         writer.run(connection::bootstrap).await??;
-        let reader = |name: &str| Worker::start(name, connection::open_reader(&path)?, None, supervisor);
+        let reader =
+            |name: &str| Worker::start(name, connection::open_reader(&path)?, None, supervisor);
         let beside = Beside {
             long: reader("sqlite-reader")?,
             short: reader("sqlite-look-up")?,
             log: Worker::start("sqlite-log", connection::open_copier(&path)?, None, supervisor)?,
         };
-        let store = Self {
-            beside: Some(beside),
-            writer,
-            path: Some(path),
-            supervisor: supervisor.clone(),
-        };
+        let store =
+            Self { beside: Some(beside), writer, path: Some(path), supervisor: supervisor.clone() };
         apply(&store, migrations).await?;
         Ok(store)
     }
@@ -109,12 +117,7 @@ impl SqliteStore {
     pub async fn in_memory(supervisor: &Supervisor) -> Result<Self, StoreError> {
         let writer = Worker::start("sqlite-memory", connection::open_memory()?, None, supervisor)?;
         writer.run(connection::bootstrap).await??;
-        let store = Self {
-            beside: None,
-            writer,
-            path: None,
-            supervisor: supervisor.clone(),
-        };
+        let store = Self { beside: None, writer, path: None, supervisor: supervisor.clone() };
         apply(&store, &Migrations::default()).await?;
         Ok(store)
     }
@@ -181,9 +184,7 @@ impl SqliteStore {
         let limit = i64::try_from(STEP).unwrap_or(i64::MAX);
         let (mut place, mut replaced) = (0, 0);
         loop {
-            let found = self
-                .read(move |connection| texts.after(connection, place, limit))
-                .await?;
+            let found = self.read(move |connection| texts.after(connection, place, limit)).await?;
             let Some(last) = found.last() else {
                 return Ok(replaced);
             };
@@ -215,9 +216,7 @@ async fn export_apart(
     supervisor
         .spawn_thread("sqlite-export", TaskPolicy::MayEnd, run)
         .map_err(|error| StoreError::Unavailable(format!("no thread for the export: {error}")))?;
-    answered
-        .await
-        .map_err(|_| StoreError::Unavailable("the export ended".to_owned()))?
+    answered.await.map_err(|_| StoreError::Unavailable("the export ended".to_owned()))?
 }
 
 #[async_trait]
@@ -236,17 +235,13 @@ impl CommitLog for SqliteStore {
     }
 
     async fn commits_after(&self, revision: u64, limit: usize) -> Result<CommitBatch, StoreError> {
-        self.read(move |connection| commit::commits_after(connection, revision, limit))
-            .await
+        self.read(move |connection| commit::commits_after(connection, revision, limit)).await
     }
 
     async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError> {
         let group = encode_group(records).map_err(CommitError::NotWritten)?;
         // A job that was not taken was not done; one that was taken answers.
-        let done = self
-            .writer
-            .run(move |connection| commit::commit(connection, &group))
-            .await;
+        let done = self.writer.run(move |connection| commit::commit(connection, &group)).await;
         done.map_err(CommitError::NotWritten)?
     }
 
@@ -257,15 +252,22 @@ impl CommitLog for SqliteStore {
 
 #[async_trait]
 impl Archive for SqliteStore {
-    async fn versions(&self, key: &Key, below: Option<u64>, limit: usize) -> Result<Vec<Version>, StoreError> {
+    async fn versions(
+        &self,
+        key: &Key,
+        below: Option<u64>,
+        limit: usize,
+    ) -> Result<Vec<Version>, StoreError> {
         let key = key.clone();
-        self.read(move |connection| archive::versions(connection, &key, below, limit))
-            .await
+        self.read(move |connection| archive::versions(connection, &key, below, limit)).await
     }
 
-    async fn documents_at(&self, revision: u64, until: u64) -> Result<Vec<(Key, Option<Document>)>, StoreError> {
-        self.read(move |connection| archive::documents_at(connection, revision, until))
-            .await
+    async fn documents_at(
+        &self,
+        revision: u64,
+        until: u64,
+    ) -> Result<Vec<(Key, Option<Document>)>, StoreError> {
+        self.read(move |connection| archive::documents_at(connection, revision, until)).await
     }
 
     async fn trim(&self, floor: u64, keep_versions: u32) -> Result<u64, StoreError> {
@@ -282,13 +284,9 @@ impl Archive for SqliteStore {
             self.write(move |connection| trim::remove_versions(connection, now_trimmed, &keys))
                 .await?;
         }
-        self.write(move |connection| trim::note(connection, now_trimmed))
-            .await?;
+        self.write(move |connection| trim::note(connection, now_trimmed)).await?;
         let time = now().as_millis();
-        while self
-            .write(move |connection| trim::remove_expired(connection, time))
-            .await?
-        {}
+        while self.write(move |connection| trim::remove_expired(connection, time)).await? {}
         super::encode::unsigned(now_trimmed.floor)
     }
 
@@ -300,14 +298,13 @@ impl Archive for SqliteStore {
     }
 
     async fn revision_before(&self, time: Timestamp) -> Result<u64, StoreError> {
-        self.read(move |connection| archive::revision_before(connection, time))
-            .await
+        self.read(move |connection| archive::revision_before(connection, time)).await
     }
 
     async fn append_audit(&self, entries: &[AuditEntry]) -> Result<(), StoreError> {
-        let entries: Vec<AuditRow> = entries.iter().map(AuditRow::encode).collect::<Result<_, _>>()?;
-        self.write(move |connection| archive::append_audit(connection, &entries))
-            .await
+        let entries: Vec<AuditRow> =
+            entries.iter().map(AuditRow::encode).collect::<Result<_, _>>()?;
+        self.write(move |connection| archive::append_audit(connection, &entries)).await
     }
 
     async fn audit(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, StoreError> {
@@ -315,10 +312,13 @@ impl Archive for SqliteStore {
         self.read(move |connection| archive::audit(connection, &query)).await
     }
 
-    async fn idempotency(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {
+    async fn idempotency(
+        &self,
+        id: &str,
+        now: Timestamp,
+    ) -> Result<Option<IdempotencyRecord>, StoreError> {
         let id = id.to_owned();
-        self.look_up(move |connection| archive::idempotency(connection, &id, now))
-            .await
+        self.look_up(move |connection| archive::idempotency(connection, &id, now)).await
     }
 }
 
@@ -326,14 +326,17 @@ impl Archive for SqliteStore {
 impl TokenStore for SqliteStore {
     async fn add_token(&self, token: &TokenRecord, audit: &AuditEntry) -> Result<(), StoreError> {
         let (token, audit) = (TokenRow::encode(token)?, AuditRow::encode(audit)?);
-        self.write(move |connection| archive::add_token(connection, &token, &audit))
-            .await
+        self.write(move |connection| archive::add_token(connection, &token, &audit)).await
     }
 
-    async fn revoke_token(&self, id: &str, time: Timestamp, audit: &AuditEntry) -> Result<bool, StoreError> {
+    async fn revoke_token(
+        &self,
+        id: &str,
+        time: Timestamp,
+        audit: &AuditEntry,
+    ) -> Result<bool, StoreError> {
         let (id, audit) = (id.to_owned(), AuditRow::encode(audit)?);
-        self.write(move |connection| archive::revoke_token(connection, &id, time, &audit))
-            .await
+        self.write(move |connection| archive::revoke_token(connection, &id, time, &audit)).await
     }
 
     async fn tokens(&self, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {
@@ -346,7 +349,9 @@ impl TokenStore for SqliteStore {
 impl Upkeep for SqliteStore {
     async fn export(&self, pieces: mpsc::Sender<Piece>) -> Result<(), StoreError> {
         match &self.path {
-            Some(path) => export_apart(connection::open_reader(path)?, &self.supervisor, pieces).await,
+            Some(path) => {
+                export_apart(connection::open_reader(path)?, &self.supervisor, pieces).await
+            }
             None => self.write(move |connection| upkeep::export(connection, &pieces)).await,
         }
     }

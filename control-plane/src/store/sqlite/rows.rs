@@ -7,8 +7,10 @@ use crate::store::rows::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenR
 type Result<T> = rusqlite::Result<T>;
 
 pub(super) const EVENT: &str = "revision, batch, time, subject, request_id, changes, bytes";
-pub(super) const VERSION: &str = "key, revision, position, op, previous, time, subject, request_id, paths, document";
-pub(super) const AUDIT: &str = "id, time, revision, subject, roles, action, kind, service, name, allowed, code, \
+pub(super) const VERSION: &str =
+    "key, revision, position, op, previous, time, subject, request_id, paths, document";
+pub(super) const AUDIT: &str = "id, time, revision, subject, roles, action, kind, service, name, \
+                                allowed, code, \
                                 paths, request_id, address, detail";
 pub(super) const IDEMPOTENCY: &str = "id, body, expires, revision, answer";
 pub(super) const TOKEN: &str = "id, subject, roles, layer, create_time, expire_time, revoke_time";
@@ -21,7 +23,8 @@ pub(super) fn insert_version() -> String {
     format!("INSERT INTO versions ({VERSION}) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10)")
 }
 
-pub(super) const PUT_DOCUMENT: &str = "INSERT INTO documents (key, revision, document) VALUES (?1, ?2, ?3)
+pub(super) const PUT_DOCUMENT: &str =
+    "INSERT INTO documents (key, revision, document) VALUES (?1, ?2, ?3)
      ON CONFLICT (key) DO UPDATE SET revision = excluded.revision, document = excluded.document";
 
 /// Twice the same id is once the entry: who did not hear that it was written tries again.
@@ -100,11 +103,7 @@ pub(super) fn version(row: &Row<'_>) -> Result<VersionRow> {
 }
 
 pub(super) fn document(row: &Row<'_>) -> Result<DocumentRow> {
-    Ok(DocumentRow {
-        key: row.get(0)?,
-        revision: row.get(1)?,
-        document: row.get(2)?,
-    })
+    Ok(DocumentRow { key: row.get(0)?, revision: row.get(1)?, document: row.get(2)? })
 }
 
 pub(super) fn bind_audit(statement: &mut Statement<'_>, row: &AuditRow) -> Result<usize> {
@@ -148,7 +147,11 @@ pub(super) fn audit(row: &Row<'_>) -> Result<AuditRow> {
 }
 
 /// Changes nothing if there is a record that has not expired at `now`.
-pub(super) fn bind_idempotency(statement: &mut Statement<'_>, row: &IdempotencyRow, now: i64) -> Result<usize> {
+pub(super) fn bind_idempotency(
+    statement: &mut Statement<'_>,
+    row: &IdempotencyRow,
+    now: i64,
+) -> Result<usize> {
     statement.execute(params![row.id, row.body, row.expires, row.revision, row.answer, now])
 }
 

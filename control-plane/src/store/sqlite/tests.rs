@@ -16,10 +16,7 @@ struct Files {
 
 impl Files {
     fn new() -> Self {
-        Self {
-            folder: tempfile::tempdir().unwrap(),
-            supervisor: Supervisor::new("test"),
-        }
+        Self { folder: tempfile::tempdir().unwrap(), supervisor: Supervisor::new("test") }
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -44,17 +41,12 @@ async fn the_log_is_copied_into_the_file_by_tidying_and_begun_anew() {
         // Without its log the file has it all.
         std::fs::copy(files.path("store"), &alone).unwrap();
         let copy = rusqlite::Connection::open(&alone).unwrap();
-        let head: i64 = copy
-            .query_row("SELECT max(revision) FROM events", [], |row| row.get(0))
-            .unwrap();
+        let head: i64 =
+            copy.query_row("SELECT max(revision) FROM events", [], |row| row.get(0)).unwrap();
         assert_eq!(head.unsigned_abs(), revision);
         sizes.push(std::fs::metadata(&log).unwrap().len());
     }
-    assert_eq!(
-        sizes[40..].iter().max(),
-        sizes[5..40].iter().max(),
-        "it does not grow: {sizes:?}"
-    );
+    assert_eq!(sizes[40..].iter().max(), sizes[5..40].iter().max(), "it does not grow: {sizes:?}");
     store.close().await;
     assert!(!log.exists());
 }
@@ -63,12 +55,12 @@ async fn the_log_is_copied_into_the_file_by_tidying_and_begun_anew() {
 async fn a_second_opening_is_refused_until_the_first_is_closed() {
     let files = Files::new();
     let first = files.store().await;
-    let refused = SqliteStore::open(&files.path("store"), &files.supervisor)
-        .await
-        .err()
-        .unwrap();
+    let refused = SqliteStore::open(&files.path("store"), &files.supervisor).await.err().unwrap();
     assert!(
-        matches!(&refused, StoreError::Refused(text) if text.contains("one process per SQLite file")),
+        matches!(
+            &refused,
+            StoreError::Refused(text) if text.contains("one process per SQLite file"),
+        ),
         "{refused}"
     );
     // By another path to the same file, too.
@@ -110,22 +102,22 @@ async fn a_long_read_holds_up_neither_commits_nor_health() {
         drop(end);
     };
     let both = async { tokio::join!(long, others) };
-    let (long, ()) = tokio::time::timeout(std::time::Duration::from_secs(10), both)
-        .await
-        .unwrap();
+    let (long, ()) = tokio::time::timeout(std::time::Duration::from_secs(10), both).await.unwrap();
     long.unwrap();
 }
 
 #[tokio::test]
 async fn a_folder_that_is_not_there_is_refused_at_once() {
     let files = Files::new();
-    for path in [
-        files.folder.path().join("missing").join("store.db"),
-        PathBuf::from("/dev/null/store.db"),
-    ] {
+    for path in
+        [files.folder.path().join("missing").join("store.db"), PathBuf::from("/dev/null/store.db")]
+    {
         let error = SqliteStore::open(&path, &files.supervisor).await.err().unwrap();
         assert!(
-            matches!(&error, StoreError::Refused(text) if text.contains("control_plane.store.sqlite.path")),
+            matches!(
+                &error,
+                StoreError::Refused(text) if text.contains("control_plane.store.sqlite.path"),
+            ),
             "{error}"
         );
         assert!(!error.is_transient());
@@ -140,9 +132,7 @@ async fn a_shutdown_ends_its_threads() {
     let report = files.supervisor.shutdown(std::time::Duration::from_secs(10)).await;
     assert!(report.is_clean(), "{report:?}");
     assert!(matches!(store.head().await, Err(StoreError::Unavailable(_))));
-    let again = SqliteStore::open(&files.path("store"), &Supervisor::new("again"))
-        .await
-        .unwrap();
+    let again = SqliteStore::open(&files.path("store"), &Supervisor::new("again")).await.unwrap();
     assert_eq!(again.head().await.unwrap(), 1);
 }
 
@@ -153,7 +143,8 @@ async fn a_full_disk_is_an_error_and_goes_on_when_there_is_room() {
     store.commit(&[record(commit(1, &["a"]))]).await.unwrap();
     let pages = |limit: i64| {
         store.write(move |connection| {
-            let set = connection.pragma_update_and_check(None, "max_page_count", limit, |row| row.get::<_, i64>(0));
+            let set = connection
+                .pragma_update_and_check(None, "max_page_count", limit, |row| row.get::<_, i64>(0));
             set.map_err(errors::store_error)
         })
     };
@@ -163,9 +154,7 @@ async fn a_full_disk_is_an_error_and_goes_on_when_there_is_room() {
     document.spec = Arc::new(serde_json::json!({ "config": { "text": "x".repeat(200_000) } }));
     large.changes[0].document = Arc::new(document);
     let error = store.commit(&[record(large.clone())]).await.unwrap_err();
-    let CommitError::NotWritten(StoreError::Unavailable(text)) = &error else {
-        panic!("{error}")
-    };
+    let CommitError::NotWritten(StoreError::Unavailable(text)) = &error else { panic!("{error}") };
     assert!(text.contains("free space"), "{text}");
     assert_eq!(store.load().await.unwrap().revision, 1);
     pages(now + 10_000).await.unwrap();
@@ -180,17 +169,12 @@ async fn a_file_that_may_not_be_written_is_an_error() {
     store.commit(&[record(commit(1, &["a"]))]).await.unwrap();
     store
         .write(|connection| {
-            connection
-                .pragma_update(None, "query_only", "ON")
-                .map_err(errors::store_error)
+            connection.pragma_update(None, "query_only", "ON").map_err(errors::store_error)
         })
         .await
         .unwrap();
     let error = store.commit(&[record(commit(2, &["a"]))]).await.unwrap_err();
-    assert!(
-        matches!(&error, CommitError::NotWritten(StoreError::Unavailable(_))),
-        "{error}"
-    );
+    assert!(matches!(&error, CommitError::NotWritten(StoreError::Unavailable(_))), "{error}");
     assert_eq!(store.head().await.unwrap(), 1);
 }
 
@@ -198,10 +182,7 @@ async fn a_file_that_may_not_be_written_is_an_error() {
 async fn a_file_of_another_program_is_left_alone() {
     let files = Files::new();
     let path = files.path("store");
-    Connection::open(&path)
-        .unwrap()
-        .execute_batch("CREATE TABLE addresses (name TEXT)")
-        .unwrap();
+    Connection::open(&path).unwrap().execute_batch("CREATE TABLE addresses (name TEXT)").unwrap();
     let before = std::fs::read(&path).unwrap();
     let error = SqliteStore::open(&path, &files.supervisor).await.err().unwrap();
     assert!(
@@ -209,11 +190,8 @@ async fn a_file_of_another_program_is_left_alone() {
         "{error}"
     );
     assert_eq!(std::fs::read(&path).unwrap(), before);
-    std::fs::write(
-        &path,
-        "no database at all, but long enough to be looked at as one".repeat(20),
-    )
-    .unwrap();
+    std::fs::write(&path, "no database at all, but long enough to be looked at as one".repeat(20))
+        .unwrap();
     let error = SqliteStore::open(&path, &files.supervisor).await.err().unwrap();
     assert!(matches!(error, StoreError::Corrupt(_)), "{error}");
 }
@@ -246,10 +224,7 @@ async fn a_plan_changes_nothing() {
 async fn a_backup_is_made_beside_a_running_process() {
     let files = Files::new();
     let store = files.store().await;
-    store
-        .commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))])
-        .await
-        .unwrap();
+    store.commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))]).await.unwrap();
     let mut file = Vec::new();
     let path = files.path("store");
     let summary = backup::write(
@@ -264,10 +239,7 @@ async fn a_backup_is_made_beside_a_running_process() {
         &mut file,
     )
     .await;
-    assert!(matches!(
-        refused,
-        Err(backup::BackupError::Store(StoreError::Refused(_)))
-    ));
+    assert!(matches!(refused, Err(backup::BackupError::Store(StoreError::Refused(_)))));
     assert!(!missing.exists());
 }
 
@@ -276,10 +248,7 @@ async fn in_memory_it_is_a_store_as_well() {
     let supervisor = Supervisor::new("test");
     let store = SqliteStore::in_memory(&supervisor).await.unwrap();
     assert!(!store.is_shared());
-    store
-        .commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))])
-        .await
-        .unwrap();
+    store.commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))]).await.unwrap();
     assert_eq!(store.load().await.unwrap().documents.len(), 2);
     assert_eq!(store.trim(1, 1).await.unwrap(), 1);
     assert_eq!(store.commits_after(1, 10).await.unwrap().commits.len(), 1);

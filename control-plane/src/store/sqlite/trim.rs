@@ -18,7 +18,11 @@ pub(super) struct Work {
 }
 
 /// Raises the floor. Readers see that before anything goes.
-pub(super) fn raise_floor(connection: &mut Connection, floor: u64, keep: u32) -> Result<Work, StoreError> {
+pub(super) fn raise_floor(
+    connection: &mut Connection,
+    floor: u64,
+    keep: u32,
+) -> Result<Work, StoreError> {
     let transaction = connection
         .transaction_with_behavior(TransactionBehavior::Immediate)
         .map_err(store_error)?;
@@ -46,7 +50,8 @@ pub(super) fn raise_floor(connection: &mut Connection, floor: u64, keep: u32) ->
 pub(super) fn remove_events(connection: &Connection, floor: i64) -> Result<bool, StoreError> {
     let removed = connection
         .execute(
-            "DELETE FROM events WHERE revision IN (SELECT revision FROM events WHERE revision <= ?1 ORDER BY revision LIMIT ?2)",
+            "DELETE FROM events WHERE revision IN (SELECT revision FROM events WHERE revision <= \
+             ?1 ORDER BY revision LIMIT ?2)",
             [floor, ROWS],
         )
         .map_err(store_error)?;
@@ -54,7 +59,11 @@ pub(super) fn remove_events(connection: &Connection, floor: i64) -> Result<bool,
 }
 
 /// Removes what these documents have to spare.
-pub(super) fn remove_versions(connection: &mut Connection, now: Trimmed, keys: &[String]) -> Result<(), StoreError> {
+pub(super) fn remove_versions(
+    connection: &mut Connection,
+    now: Trimmed,
+    keys: &[String],
+) -> Result<(), StoreError> {
     let transaction = connection
         .transaction_with_behavior(TransactionBehavior::Immediate)
         .map_err(store_error)?;
@@ -85,7 +94,8 @@ pub(super) fn remove_expired(connection: &Connection, now: i64) -> Result<bool, 
         ("audit", "time", now.saturating_sub(AUDIT_KEPT_MS)),
     ] {
         let sql = format!(
-            "DELETE FROM {table} WHERE id IN (SELECT id FROM {table} WHERE {column} <= ?1 ORDER BY {column} LIMIT ?2)"
+            "DELETE FROM {table} WHERE id IN (SELECT id FROM {table} WHERE {column} <= ?1 ORDER BY \
+             {column} LIMIT ?2)"
         );
         removed += connection.execute(&sql, [limit, ROWS]).map_err(store_error)?;
     }
@@ -97,7 +107,8 @@ pub(super) fn note(connection: &Connection, now: Trimmed) -> Result<(), StoreErr
     let text = format!("{} {} {}", now.floor, now.head, now.keep);
     connection
         .execute(
-            "INSERT INTO meta (name, value) VALUES ('trimmed', ?1) ON CONFLICT (name) DO UPDATE SET value = excluded.value",
+            "INSERT INTO meta (name, value) VALUES ('trimmed', ?1) ON CONFLICT (name) DO UPDATE \
+             SET value = excluded.value",
             [text],
         )
         .map_err(store_error)?;

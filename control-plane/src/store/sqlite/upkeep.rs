@@ -13,7 +13,10 @@ use crate::store::upkeep::{
 };
 
 /// Reads everything in one snapshot. Blocks the thread.
-pub(super) fn export(connection: &mut Connection, pieces: &mpsc::Sender<Piece>) -> Result<(), StoreError> {
+pub(super) fn export(
+    connection: &mut Connection,
+    pieces: &mpsc::Sender<Piece>,
+) -> Result<(), StoreError> {
     let transaction = connection.transaction().map_err(store_error)?;
     let send = |piece| pieces.blocking_send(piece).map_err(|_| gone());
     send(Piece::Head(BackupHead {
@@ -33,25 +36,26 @@ pub(super) fn export(connection: &mut Connection, pieces: &mpsc::Sender<Piece>) 
     each("SELECT key, revision, document FROM documents ORDER BY key", |row| {
         rows::document(row).map(Row::Document)
     })?;
-    each(
-        &format!("SELECT {} FROM versions ORDER BY revision, position", rows::VERSION),
-        |row| rows::version(row).map(Row::Version),
-    )?;
+    each(&format!("SELECT {} FROM versions ORDER BY revision, position", rows::VERSION), |row| {
+        rows::version(row).map(Row::Version)
+    })?;
     each(&format!("SELECT {} FROM audit ORDER BY id", rows::AUDIT), |row| {
         rows::audit(row).map(Box::new).map(Row::Audit)
     })?;
     each(&format!("SELECT {} FROM tokens ORDER BY id", rows::TOKEN), |row| {
         rows::token(row).map(Row::Token)
     })?;
-    each(
-        &format!("SELECT {} FROM idempotency ORDER BY id", rows::IDEMPOTENCY),
-        |row| rows::idempotency(row).map(Row::Idempotency),
-    )?;
+    each(&format!("SELECT {} FROM idempotency ORDER BY id", rows::IDEMPOTENCY), |row| {
+        rows::idempotency(row).map(Row::Idempotency)
+    })?;
     send(Piece::End)
 }
 
 /// Writes everything in one transaction. Blocks the thread.
-pub(super) fn import(connection: &mut Connection, mut pieces: mpsc::Receiver<Piece>) -> Result<Restored, StoreError> {
+pub(super) fn import(
+    connection: &mut Connection,
+    mut pieces: mpsc::Receiver<Piece>,
+) -> Result<Restored, StoreError> {
     let transaction = connection
         .transaction_with_behavior(TransactionBehavior::Immediate)
         .map_err(store_error)?;
@@ -89,10 +93,7 @@ pub(super) fn import(connection: &mut Connection, mut pieces: mpsc::Receiver<Pie
     };
     set_number(&transaction, "floor", signed(restored.revision))?;
     transaction
-        .execute(
-            "UPDATE meta SET value = ?1 WHERE name = 'store_id'",
-            [&restored.store_id],
-        )
+        .execute("UPDATE meta SET value = ?1 WHERE name = 'store_id'", [&restored.store_id])
         .map_err(store_error)?;
     transaction.commit().map_err(store_error)?;
     Ok(restored)
@@ -101,7 +102,8 @@ pub(super) fn import(connection: &mut Connection, mut pieces: mpsc::Receiver<Pie
 fn is_empty(connection: &Connection) -> Result<bool, StoreError> {
     let rows: i64 = connection
         .query_row(
-            "SELECT (SELECT count(*) FROM documents) + (SELECT count(*) FROM versions) + (SELECT count(*) FROM tokens)",
+            "SELECT (SELECT count(*) FROM documents) + (SELECT count(*) FROM versions) + (SELECT \
+             count(*) FROM tokens)",
             [],
             |row| row.get(0),
         )
@@ -132,7 +134,12 @@ impl Texts {
     }
 
     /// The next texts behind a place.
-    pub(super) fn after(self, connection: &Connection, rowid: i64, limit: i64) -> Result<Vec<Text>, StoreError> {
+    pub(super) fn after(
+        self,
+        connection: &Connection,
+        rowid: i64,
+        limit: i64,
+    ) -> Result<Vec<Text>, StoreError> {
         let sql = format!(
             "SELECT rowid, key, document FROM {} WHERE rowid > ?1 ORDER BY rowid LIMIT ?2",
             self.table()
@@ -140,11 +147,7 @@ impl Texts {
         let mut statement = connection.prepare(&sql).map_err(store_error)?;
         let found = statement
             .query_map([rowid, limit], |row| {
-                Ok(Text {
-                    rowid: row.get(0)?,
-                    key: row.get(1)?,
-                    text: row.get(2)?,
-                })
+                Ok(Text { rowid: row.get(0)?, key: row.get(1)?, text: row.get(2)? })
             })
             .map_err(store_error)?;
         found.collect::<Result<_, _>>().map_err(store_error)

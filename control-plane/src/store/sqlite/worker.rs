@@ -4,8 +4,8 @@
 //! async callers ──[64 jobs]──▶ thread (connection) ──▶ answer of each job
 //! ```
 //!
-//! SQLite blocks, so it never runs on a thread of the asynchronous runtime. The thread ends, and closes the file, when
-//! the worker is closed or dropped, or when the supervisor ends its tasks.
+//! SQLite blocks, so it never runs on a thread of the asynchronous runtime. The thread ends, and
+//! closes the file, when the worker is closed or dropped, or when the supervisor ends its tasks.
 
 use blaze_runtime::supervisor::{StopOnDrop, Supervisor, TaskHandle, TaskPolicy};
 use rusqlite::Connection;
@@ -55,14 +55,11 @@ impl Worker {
                 let _ = jobs.send(Message::Stop).await;
             }
         });
-        Ok(Self {
-            jobs,
-            thread,
-            _watcher: watcher.stop_on_drop(),
-        })
+        Ok(Self { jobs, thread, _watcher: watcher.stop_on_drop() })
     }
 
-    /// Does a job on the thread. Once it has been taken it is done, whether its answer is waited for or not.
+    /// Does a job on the thread. Once it has been taken it is done, whether its answer is waited
+    /// for or not.
     ///
     /// # Errors
     /// [`StoreError::Unavailable`] after the end of the thread.
@@ -94,7 +91,10 @@ fn work(mut connection: Connection, mut queue: mpsc::Receiver<Message>, lock: Op
         job(&mut connection);
     }
     if let Err((_, error)) = connection.close() {
-        tracing::warn!(%error, "the database file was not closed in order; it recovers at the next start");
+        tracing::warn!(
+            %error,
+            "the database file was not closed in order; it recovers at the next start",
+        );
     }
     drop(lock);
 }

@@ -109,18 +109,15 @@ impl World {
 
     /// The part of its threads that a level takes.
     fn work(&self, step: usize) -> f64 {
-        step.checked_sub(1).map_or(0.0, |at| {
-            self.rate_hz * self.costs[at] * MS * self.slowness / self.threads
-        })
+        step.checked_sub(1)
+            .map_or(0.0, |at| self.rate_hz * self.costs[at] * MS * self.slowness / self.threads)
     }
 
     /// Most changes in any minute that begins at this second or later.
     fn changes_a_minute(&self, from: f64) -> usize {
         let late = || self.changes.iter().filter(|change| change.0 >= from);
         let minutes = late().map(|first| {
-            late()
-                .filter(|other| (first.0..first.0 + 60.0).contains(&other.0))
-                .count()
+            late().filter(|other| (first.0..first.0 + 60.0).contains(&other.0)).count()
         });
         minutes.max().unwrap_or(0)
     }
@@ -150,7 +147,10 @@ fn a_steady_world_gets_the_highest_level_that_fits_and_keeps_it() {
                     );
                     // Too much work does not last.
                     let first = world.changes.first().map_or(f64::INFINITY, |change| change.0);
-                    assert!(world.work(world.effort.top) < 1.0 || first < 5.0, "slow to react, {at}");
+                    assert!(
+                        world.work(world.effort.top) < 1.0 || first < 5.0,
+                        "slow to react, {at}"
+                    );
                 }
             }
         }
@@ -171,16 +171,10 @@ fn topics_share_a_pool_and_come_to_rest() {
             world.run(1.0);
         }
     }
-    let busy: f64 = worlds
-        .iter()
-        .map(|world| world.work(world.effort.step) * world.threads)
-        .sum();
+    let busy: f64 = worlds.iter().map(|world| world.work(world.effort.step) * world.threads).sum();
     let levels: Vec<u8> = worlds.iter().map(World::level).collect();
     assert!(busy > 0.8 && busy < 1.8, "{busy} of {threads} threads, {levels:?}");
-    assert!(
-        levels[0] >= 3 && levels[3] == 10,
-        "two images a second are no burden: {levels:?}"
-    );
+    assert!(levels[0] >= 3 && levels[3] == 10, "two images a second are no burden: {levels:?}");
     for world in &worlds {
         assert!(world.changes_a_minute(60.0) <= 2, "{:?}", world.changes);
     }
@@ -227,7 +221,8 @@ fn a_processor_that_was_slow_is_not_slow_for_ever() {
 
 #[test]
 fn a_step_that_does_not_last_is_tried_later_and_later() {
-    // The larger frames of a lower level leave fewer for the pool: as soon as it is raised there are more again.
+    // The larger frames of a lower level leave fewer for the pool: as soon as it is raised there
+    // are more again.
     let mut world = World::new(1, [30.0; STEP_COUNT], 1.0, 60.0);
     let until = 3_600.0;
     while world.seconds() < until {
@@ -235,18 +230,10 @@ fn a_step_that_does_not_last_is_tried_later_and_later() {
         world.run(1.0);
     }
     let count = |from: f64, to: f64| {
-        world
-            .changes
-            .iter()
-            .filter(|change| (from..to).contains(&change.0))
-            .count()
+        world.changes.iter().filter(|change| (from..to).contains(&change.0)).count()
     };
     assert!(world.changes_a_minute(0.0) <= 4, "{:?}", world.changes);
-    assert!(
-        count(600.0, 1_200.0) <= 4 && count(1_800.0, 3_600.0) <= 6,
-        "{:?}",
-        world.changes
-    );
+    assert!(count(600.0, 1_200.0) <= 4 && count(1_800.0, 3_600.0) <= 6, "{:?}", world.changes);
     assert!(count(1_800.0, 3_600.0) >= 2, "it is not given up");
 }
 
@@ -255,9 +242,7 @@ fn one_slow_frame_changes_nothing() {
     let mut world = World::new(10, RECORDING, 1.0, 20.0);
     world.run(30.0);
     for _ in 0..20 {
-        world
-            .effort
-            .compressed(world.now, 10, 2.0, FRAME_BYTES, FRAME_BYTES / 2);
+        world.effort.compressed(world.now, 10, 2.0, FRAME_BYTES, FRAME_BYTES / 2);
         world.run(5.0);
     }
     assert!(world.changes.is_empty(), "{:?}", world.changes);
@@ -269,10 +254,7 @@ fn what_does_not_become_smaller_goes_as_it_is_and_is_tried_again() {
     world.ratio = 0.98;
     world.run(1.0);
     assert!(world.effort.incompressible && world.effort.goes_as_it_is());
-    assert!(
-        world.effort.wanted().abs() < 1e-9,
-        "others may have its part of the pool"
-    );
+    assert!(world.effort.wanted().abs() < 1e-9, "others may have its part of the pool");
     assert_eq!(world.tried, 20);
     world.run(100.0);
     assert_eq!(world.tried, 20 + 10, "one frame in ten seconds");
@@ -304,7 +286,8 @@ fn strange_figures_do_no_harm() {
 #[test]
 fn a_pool_is_divided_by_what_is_wanted() {
     let near = |found: &[f64], expected: &[f64]| {
-        let fits = found.len() == expected.len() && found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 0.02);
+        let fits = found.len() == expected.len()
+            && found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 0.02);
         assert!(fits, "{found:?} instead of {expected:?}");
     };
     near(&shares(4.0, &[]), &[]);
@@ -320,7 +303,8 @@ fn a_pool_is_divided_by_what_is_wanted() {
     for wanted in [[0.0, 1.0, 7.0], [f64::NAN, 1.0, f64::INFINITY]] {
         let shares = shares(2.0, &wanted);
         assert!(
-            (shares.iter().sum::<f64>() - 2.0).abs() < 1e-9 && shares.iter().all(|share| *share > 0.0),
+            (shares.iter().sum::<f64>() - 2.0).abs() < 1e-9
+                && shares.iter().all(|share| *share > 0.0),
             "{shares:?}"
         );
     }

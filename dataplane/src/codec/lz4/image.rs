@@ -7,7 +7,8 @@ pub(crate) const FRAME_BYTES: usize = WIDTH * HEIGHT * 3;
 const WIDTH: usize = 640;
 const HEIGHT: usize = 480;
 
-/// One frame: planes of light that fall off, edges, and a sensor whose noise changes every fourth byte or so by one.
+/// One frame: planes of light that fall off, edges, and a sensor whose noise changes every fourth
+/// byte or so by one.
 pub(crate) fn frame(number: u64) -> Vec<u8> {
     let mut noise = Random(number);
     let moved = usize::try_from(number % 640).unwrap_or(0) * 3;

@@ -7,11 +7,7 @@ use proptest::prelude::*;
 use std::time::{Duration, Instant};
 
 fn inputs() -> usize {
-    if std::env::var_os("BLAZE_LONG").is_some() {
-        100_000
-    } else {
-        5_000
-    }
+    if std::env::var_os("BLAZE_LONG").is_some() { 100_000 } else { 5_000 }
 }
 
 /// What a payload becomes on its way, and that it fits.
@@ -28,7 +24,8 @@ fn there_and_back(payload: &[u8], level: u8) -> Option<usize> {
     Some(block.len())
 }
 
-/// librdkafka brings an LZ4 of its own; with both in one program the linker would take either, and the levels differ.
+/// librdkafka brings an LZ4 of its own; with both in one program the linker would take either, and
+/// the levels differ.
 #[test]
 fn the_linked_lz4_is_the_one_that_was_built_for_us() {
     assert_eq!(::lz4::version(), 11_000, "rdkafka needs its feature external-lz4");
@@ -51,10 +48,7 @@ fn every_level_takes_what_is_small_long_or_repeats() {
     for level in 1..=12 {
         for length in 0..40 {
             let few = vec![b'x'; length];
-            assert!(
-                there_and_back(&few, level).is_none_or(|_| length >= SMALLEST),
-                "{length}"
-            );
+            assert!(there_and_back(&few, level).is_none_or(|_| length >= SMALLEST), "{length}");
         }
         let repeated = vec![7; 300_000];
         let length = there_and_back(&repeated, level).unwrap();
@@ -98,16 +92,10 @@ fn a_size_is_checked_before_memory_is_taken_for_it() {
     }
     assert!(matches!(refused(10, 2_551), Refused::Impossible { found: 10, .. }));
     assert!(matches!(refused(0, 1), Refused::Impossible { .. }));
-    assert!(matches!(
-        refused(MAX_PAYLOAD_BYTES + 1, 1),
-        Refused::BlockTooLarge { .. }
-    ));
+    assert!(matches!(refused(MAX_PAYLOAD_BYTES + 1, 1), Refused::BlockTooLarge { .. }));
     assert!(matches!(refused(usize::MAX, 1), Refused::BlockTooLarge { .. }));
     assert_eq!(check(10, 2_550), Ok((2_550, 2_550)));
-    assert_eq!(
-        announced_size(MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES as u64),
-        Ok(MAX_PAYLOAD_BYTES)
-    );
+    assert_eq!(announced_size(MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES as u64), Ok(MAX_PAYLOAD_BYTES));
 }
 
 #[test]
@@ -130,17 +118,15 @@ fn only_the_announced_size_is_accepted() {
     assert_eq!(decompress(&block, 1_600).unwrap(), payload);
     assert_eq!(
         decompress(&block, 1_700),
-        Err(Refused::OtherSize {
-            announced: 1_700,
-            found: 1_600
-        })
+        Err(Refused::OtherSize { announced: 1_700, found: 1_600 })
     );
     assert_eq!(decompress(&block, 1_500), Err(Refused::Damaged { announced: 1_500 }));
     assert!(decompress(b"", 0).is_err());
     assert_eq!(decompress(&[0], 0).unwrap(), Bytes::new());
 }
 
-/// A block as it might come from outside: damaged in some way, and a size that somebody announces for it.
+/// A block as it might come from outside: damaged in some way, and a size that somebody announces
+/// for it.
 fn strange_block(noise: &mut Random, good: &[(Bytes, usize)]) -> (Vec<u8>, u64) {
     let (block, size) = &good[noise.index(good.len())];
     let (mut bytes, mut announced) = (block.to_vec(), *size as u64);
@@ -181,8 +167,9 @@ fn strange_block(noise: &mut Random, good: &[(Bytes, usize)]) -> (Vec<u8>, u64) 
     (bytes, announced)
 }
 
-/// 5,000 inputs, or 100,000 with `BLAZE_LONG`. What is given has the announced size, which is within the bound, and no
-/// other memory is taken: that for the result is the only one, and [`check`] comes before it.
+/// 5,000 inputs, or 100,000 with `BLAZE_LONG`. What is given has the announced size, which is
+/// within the bound, and no other memory is taken: that for the result is the only one, and
+/// [`check`] comes before it.
 #[test]
 fn codec_inputs() {
     let mut noise = Random(20_261_122);
@@ -209,18 +196,17 @@ fn codec_inputs() {
                 taken += 1;
             }
             Err(reason) => {
-                let before_memory = !matches!(reason, Refused::Damaged { .. } | Refused::OtherSize { .. });
-                let allowed = announced <= MAX_PAYLOAD_BYTES as u64 && announced <= block.len() as u64 * 255;
+                let before_memory =
+                    !matches!(reason, Refused::Damaged { .. } | Refused::OtherSize { .. });
+                let allowed =
+                    announced <= MAX_PAYLOAD_BYTES as u64 && announced <= block.len() as u64 * 255;
                 assert_eq!(before_memory, !allowed, "input {number}: {reason}");
                 refused += 1;
             }
         }
         longest = longest.max(began.elapsed());
     }
-    assert!(
-        taken > inputs() / 20 && refused > inputs() / 2,
-        "{taken} taken, {refused} refused"
-    );
+    assert!(taken > inputs() / 20 && refused > inputs() / 2, "{taken} taken, {refused} refused");
     assert!(longest < Duration::from_secs(5), "{longest:?}");
     println!("{taken} taken, {refused} refused, longest {longest:?}");
 }

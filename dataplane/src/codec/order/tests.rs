@@ -45,10 +45,7 @@ fn what_is_ready_waits_for_what_came_before_in_its_line() {
     assert!(queue.is_clear(&(1, 'b')) && queue.holds(&1));
     queue.push_ready((1, 'b'), 8, 10).unwrap();
     queue.push_ready((2, 'a'), 9, 10).unwrap();
-    assert_eq!(
-        (pop_all(&mut queue, (1, 'b')), pop_all(&mut queue, (2, 'a'))),
-        (vec![8], vec![9])
-    );
+    assert_eq!((pop_all(&mut queue, (1, 'b')), pop_all(&mut queue, (2, 'a'))), (vec![8], vec![9]));
     let (first, item) = begin(&mut queue).unwrap();
     assert_eq!((item, *first.key()), (2, key));
     let (second, _) = begin(&mut queue).unwrap();
@@ -58,13 +55,11 @@ fn what_is_ready_waits_for_what_came_before_in_its_line() {
     assert_eq!(queue.held(), Waiting { items: 3, bytes: 160 });
     assert!(queue.finish(&first, 50));
     assert_eq!(pop_all(&mut queue, key), [2, 33, 4]);
-    assert_eq!(
-        (queue.held(), queue.waits(LONG)),
-        (Waiting::default(), Waiting::default())
-    );
+    assert_eq!((queue.held(), queue.waits(LONG)), (Waiting::default(), Waiting::default()));
 }
 
-/// A frame that replaces a waiting one has waited as long as that: else who publishes often would never be begun with.
+/// A frame that replaces a waiting one has waited as long as that: else who publishes often would
+/// never be begun with.
 #[test]
 fn who_gives_way_leaves_its_turn_to_the_newer_one() {
     let mut queue = Queue::new(ROOMY);
@@ -129,11 +124,19 @@ struct Entry {
 impl Model {
     fn sum(&self, wanted: impl Fn(&Entry) -> bool) -> Waiting {
         let of = self.all.iter().filter(|entry| wanted(entry));
-        let (items, bytes) = of.fold((0, 0), |(items, bytes), entry| (items + 1, bytes + entry.bytes));
+        let (items, bytes) =
+            of.fold((0, 0), |(items, bytes), entry| (items + 1, bytes + entry.bytes));
         Waiting { items, bytes }
     }
 
-    fn room(&self, key: Key, bytes: usize, waits: bool, freed: Waiting, bounds: &Bounds) -> Result<(), Full> {
+    fn room(
+        &self,
+        key: Key,
+        bytes: usize,
+        waits: bool,
+        freed: Waiting,
+        bounds: &Bounds,
+    ) -> Result<(), Full> {
         let fits = |held: Waiting, items, most| {
             let held = held.without(freed);
             held.items < items && (held.items == 0 || held.bytes + bytes <= most)
@@ -150,8 +153,17 @@ impl Model {
     }
 
     /// What would have to give way.
-    fn surplus(&self, key: Key, urgency: Urgency, bytes: usize, keep: usize, bounds: &Bounds) -> Vec<Entry> {
-        let waits = |entry: &&Entry| entry.key == key && entry.urgency == urgency && entry.stage == Stage::Waits;
+    fn surplus(
+        &self,
+        key: Key,
+        urgency: Urgency,
+        bytes: usize,
+        keep: usize,
+        bounds: &Bounds,
+    ) -> Vec<Entry> {
+        let waits = |entry: &&Entry| {
+            entry.key == key && entry.urgency == urgency && entry.stage == Stage::Waits
+        };
         let waiting: Vec<Entry> = self.all.iter().filter(waits).copied().collect();
         if keep == 0 {
             return Vec::new();
@@ -218,15 +230,21 @@ proptest! {
         let mut tickets: Vec<Ticket<u8, char>> = Vec::new();
         for (item, act) in (0u32..).zip(acts) {
             // Older tickets than these are tried too: they must do nothing.
-            let chosen = |at: usize, tickets: &[Ticket<u8, char>]| (!tickets.is_empty()).then(|| tickets[at % tickets.len()]);
+            let chosen = |at: usize,
+            tickets: &[Ticket<u8, char>]| (!tickets.is_empty())
+            .then(|| tickets[at % tickets.len()]);
             let number = queue.next;
             match act {
                 Act::Ready(key, bytes) => {
                     let room = model.room(key, bytes, false, Waiting::default(), &bounds);
-                    prop_assert_eq!(queue.push_ready(key, item, bytes), room.map_err(|full| (item, full)));
+                    prop_assert_eq!(
+                        queue.push_ready(key, item, bytes),
+                        room.map_err(|full| (item, full)),
+                    );
                     if room.is_ok() {
                         let urgency = Urgency::Quick;
-                        model.all.push(Entry { number, key, urgency, bytes, stage: Stage::Ready, item });
+                        model.all.push(Entry { number, key, urgency, bytes, stage: Stage::Ready,
+                            item });
                     }
                 }
                 Act::Wait(key, urgency, bytes, keep) => {
@@ -237,23 +255,36 @@ proptest! {
                     let pushed = queue.push_waiting(key, urgency, item, bytes, keep);
                     prop_assert_eq!(pushed.refused, room.err().map(|full| (item, full)));
                     let expected: Vec<u32> = surplus.iter().map(|entry| entry.item).collect();
-                    prop_assert_eq!(pushed.gave_way, if room.is_ok() { expected } else { Vec::new() });
+                    prop_assert_eq!(
+                        pushed.gave_way,
+                        if room.is_ok() { expected } else { Vec::new() },
+                    );
                     if room.is_ok() {
-                        model.all.retain(|entry| surplus.iter().all(|gone| gone.number != entry.number));
-                        model.all.push(Entry { number, key, urgency, bytes, stage: Stage::Waits, item });
+                        model.all.retain(|entry| surplus.iter()
+                            .all(|gone| gone.number != entry.number));
+                        model.all.push(Entry { number, key, urgency, bytes, stage: Stage::Waits,
+                            item });
                     }
                 }
                 Act::Begin(urgency) => {
                     let begun = queue.begin(urgency).map(|(ticket, item)| (ticket, *item));
-                    let waits = model.sum(|entry| entry.urgency == urgency && entry.stage == Stage::Waits);
+                    let waits =
+                        model.sum(|entry| entry.urgency == urgency && entry.stage == Stage::Waits);
                     prop_assert_eq!(begun.is_some(), waits.items > 0, "whoever waits has a turn");
                     if let Some((ticket, item)) = begun {
                         let at = model.at(ticket.number, Stage::Waits).unwrap();
-                        prop_assert_eq!((model.all[at].item, model.all[at].urgency), (item, urgency));
+                        prop_assert_eq!(
+                            (model.all[at].item, model.all[at].urgency),
+                            (item, urgency),
+                        );
                         let key = model.all[at].key;
                         let older = model.all[..at].iter();
-                        let mut older = older.filter(|entry| entry.key == key && entry.urgency == urgency);
-                        prop_assert!(older.all(|entry| entry.stage != Stage::Waits), "the oldest of its line first");
+                        let mut older =
+                            older.filter(|entry| entry.key == key && entry.urgency == urgency);
+                        prop_assert!(
+                            older.all(|entry| entry.stage != Stage::Waits),
+                            "the oldest of its line first",
+                        );
                         model.all[at].stage = Stage::Begun;
                         tickets.push(ticket);
                     }
@@ -278,10 +309,16 @@ proptest! {
                 prop_assert_eq!(queue.waits(urgency), model.sum(waits));
             }
             for group in 0..3 {
-                prop_assert_eq!(queue.holds(&group), model.sum(|entry| entry.key.0 == group).items > 0);
+                prop_assert_eq!(
+                    queue.holds(&group),
+                    model.sum(|entry| entry.key.0 == group).items > 0,
+                );
                 for line in ['a', 'b'] {
                     let key = (group, line);
-                    prop_assert_eq!(queue.is_clear(&key), model.sum(|entry| entry.key == key).items == 0);
+                    prop_assert_eq!(
+                        queue.is_clear(&key),
+                        model.sum(|entry| entry.key == key).items == 0,
+                    );
                 }
             }
         }

@@ -45,17 +45,15 @@ impl Gate {
     }
 }
 
-/// The standard library looks at the affinity mask and the quota of the control group (v1 and v2): a container with
-/// half a processor gets one thread, not as many as the machine has.
+/// The standard library looks at the affinity mask and the quota of the control group (v1 and v2):
+/// a container with half a processor gets one thread, not as many as the machine has.
 #[test]
 fn there_is_at_least_one_thread_and_not_more_than_the_most() {
     let own = threads(0);
     assert!((1..=MAX_THREADS).contains(&own));
     assert_eq!(
         own,
-        std::thread::available_parallelism()
-            .map_or(1, NonZeroUsize::get)
-            .min(MAX_THREADS)
+        std::thread::available_parallelism().map_or(1, NonZeroUsize::get).min(MAX_THREADS)
     );
     assert_eq!(
         [threads(1), threads(7), threads(64), threads(65), threads(u16::MAX)],
@@ -212,9 +210,5 @@ fn utilisation_is_the_time_in_turns() {
     let pool = CodecPool::start(2, on_threads(), nap).unwrap();
     pool.offer(2, 2);
     eventually(|| pool.counters().done == 4);
-    assert!(
-        pool.counters().busy >= Duration::from_millis(80),
-        "{:?}",
-        pool.counters()
-    );
+    assert!(pool.counters().busy >= Duration::from_millis(80), "{:?}", pool.counters());
 }

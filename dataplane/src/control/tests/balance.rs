@@ -51,10 +51,8 @@ impl Pair {
             steps: 0,
             duties: Vec::new(),
         };
-        let hello = Hello {
-            registry_version: 1,
-            ..said_by(&"edge/r".parse().unwrap(), Kind::Edge)
-        };
+        let hello =
+            Hello { registry_version: 1, ..said_by(&"edge/r".parse().unwrap(), Kind::Edge) };
         pair.bench.link_says(hello, 1, TOPICS.map(asks_for).into());
         for name in TOPICS {
             pair.bench.send(Scope::Layer, &lease("advertise", name));
@@ -95,8 +93,7 @@ impl Pair {
             ..Entry::default()
         };
         let entries: Vec<Entry> = parts.iter().map(entry).collect();
-        self.entries
-            .extend(entries.iter().map(|entry| (entry.topic.clone(), entry.clone())));
+        self.entries.extend(entries.iter().map(|entry| (entry.topic.clone(), entry.clone())));
         self.version += 1;
         self.say(Body::Delta(delta(self.version, entries)));
     }
@@ -171,37 +168,20 @@ impl Pair {
 }
 
 pub(super) fn said_by(flow: &FlowId, kind: Kind) -> Hello {
-    let layer_scope_id = if kind == Kind::Fog {
-        LayerScopeId::kafka("").0
-    } else {
-        0
-    };
-    Hello {
-        layer_scope_id,
-        ..hello_of(flow, kind)
-    }
+    let layer_scope_id = if kind == Kind::Fog { LayerScopeId::kafka("").0 } else { 0 };
+    Hello { layer_scope_id, ..hello_of(flow, kind) }
 }
 
 fn handed_to(flow: FlowId) -> Carrying {
-    Carrying::HandedOver(Handover {
-        to: Some(flow),
-        ..[7].into()
-    })
+    Carrying::HandedOver(Handover { to: Some(flow), ..[7].into() })
 }
 
 #[test]
 fn a_topic_goes_by_name_when_everything_of_it_has_arrived() {
     let mut pair = Pair::new(Some(0), [300, 200, 100]);
     let after = pair.run_until_given_up(20_000).unwrap();
-    assert!(
-        (5_000..10_000).contains(&after),
-        "settled after 5 s, uneven for 3 s: {after}"
-    );
-    assert_eq!(
-        pair.bench.core.emptying(),
-        [topic("t0")],
-        "half of what is between them"
-    );
+    assert!((5_000..10_000).contains(&after), "settled after 5 s, uneven for 3 s: {after}");
+    assert_eq!(pair.bench.core.emptying(), [topic("t0")], "half of what is between them");
     assert_eq!(pair.told("t0"), &Carrying::Carries, "until it has arrived");
     let now = pair.bench.now;
     pair.bench.core.emptied(now, 0, &topic("t1"));
@@ -211,10 +191,7 @@ fn a_topic_goes_by_name_when_everything_of_it_has_arrived() {
     let moves = pair.bench.core.moves().clone();
     let last = moves.last.unwrap();
     assert_eq!((moves.by_load, moves.settled, moves.taken_back), (1, 0, 0));
-    assert_eq!(
-        (last.topic, last.to, last.reason),
-        (topic("t0"), Some(other()), MoveReason::Load)
-    );
+    assert_eq!((last.topic, last.to, last.reason), (topic("t0"), Some(other()), MoveReason::Load));
     // The other says nothing of a load: the next one goes when both have rested.
     pair.tell(&[("t0", Carrying::Carries)]);
     assert_eq!(pair.run_until_given_up(9_000), None);
@@ -232,10 +209,7 @@ fn what_has_not_arrived_in_time_stays_and_goes_on_where_it_stopped() {
     pair.run(40);
     assert_eq!(pair.duties, [(topic("t0"), Duty::Takes(Begin::At([7].into())))]);
     assert_eq!((pair.told("t0"), pair.carried()), (&Carrying::Carries, TOPICS.to_vec()));
-    assert_eq!(
-        (pair.bench.core.moves().taken_back, pair.bench.core.moves().by_load),
-        (1, 0)
-    );
+    assert_eq!((pair.bench.core.moves().taken_back, pair.bench.core.moves().by_load), (1, 0));
     assert_eq!(pair.run_until_given_up(9_000), None, "it is not tried again at once");
     assert!(pair.run_until_given_up(8_000).is_some());
 }
@@ -269,27 +243,22 @@ fn a_flow_that_goes_does_not_wait_for_what_is_on_its_way() {
 fn while_one_says_nothing_of_its_load_nothing_goes() {
     let mut pair = Pair::new(None, [300, 200, 100]);
     assert_eq!(pair.run_until_given_up(30_000), None);
-    assert_eq!(
-        pair.carried(),
-        TOPICS,
-        "and what weighs something is not moved by a hash"
-    );
+    assert_eq!(pair.carried(), TOPICS, "and what weighs something is not moved by a hash");
 }
 
 #[test]
 fn what_weighs_little_goes_to_whom_hashing_prefers() {
     let mut pair = Pair::new(None, [10, 10, 10]);
     let able = [other(), "fog/fog-1".parse().unwrap()];
-    let prefers = |name: &&str| crate::plan::rendezvous::choose(name, able.iter()) == Some(&able[0]);
+    let prefers =
+        |name: &&str| crate::plan::rendezvous::choose(name, able.iter()) == Some(&able[0]);
     let expected: Vec<&str> = TOPICS.into_iter().filter(prefers).collect();
     assert!(!expected.is_empty(), "the names are not well chosen");
     pair.arrives = true;
     pair.run(7_000);
     assert_eq!(pair.bench.core.moves().settled, expected.len() as u64);
-    let gone: Vec<&str> = TOPICS
-        .into_iter()
-        .filter(|name| !pair.carried().contains(name))
-        .collect();
+    let gone: Vec<&str> =
+        TOPICS.into_iter().filter(|name| !pair.carried().contains(name)).collect();
     assert_eq!(gone, expected);
 }
 

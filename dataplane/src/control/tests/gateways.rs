@@ -1,4 +1,5 @@
-//! A flow that is to be on the inter scope and cannot, and what stays of services that are only not named any more.
+//! A flow that is to be on the inter scope and cannot, and what stays of services that are only not
+//! named any more.
 
 use blaze_proto::link::link_control::{Advertise, Gateway, Source};
 
@@ -11,10 +12,7 @@ const TOPIC: &str = "map";
 
 /// A flow that has read its leases and hears the channel of the layer broker.
 fn alone() -> Bench {
-    let mut bench = Bench::with(|config| ControlConfig {
-        inter_scope: true,
-        ..config
-    });
+    let mut bench = Bench::with(|config| ControlConfig { inter_scope: true, ..config });
     bench.read_leases();
     bench.core.hears_replicas(bench.now);
     bench
@@ -54,22 +52,22 @@ impl Bench {
     }
 
     /// The same in a life of its flow.
-    fn robot_announces_in(&mut self, epoch: u64, version: u64, services: &[&str], more_sources: bool) {
-        let source = |service: &&str| Source {
-            node: "robot-1".into(),
-            service: (*service).into(),
-        };
+    fn robot_announces_in(
+        &mut self,
+        epoch: u64,
+        version: u64,
+        services: &[&str],
+        more_sources: bool,
+    ) {
+        let source = |service: &&str| Source { node: "robot-1".into(), service: (*service).into() };
         let advertise = Advertise {
             transient_local: true,
             sources: services.iter().map(source).collect(),
             more_sources,
             ..Advertise::default()
         };
-        let entry = Entry {
-            topic: TOPIC.into(),
-            node_advertise: Some(advertise),
-            ..Entry::default()
-        };
+        let entry =
+            Entry { topic: TOPIC.into(), node_advertise: Some(advertise), ..Entry::default() };
         self.robot_says_in(epoch, version, entry);
     }
 
@@ -79,10 +77,7 @@ impl Bench {
     }
 
     fn robot_says_in(&mut self, epoch: u64, version: u64, entry: Entry) {
-        let hello = Hello {
-            epoch,
-            ..said_by(&"edge/robot-1".parse().unwrap(), Kind::Edge)
-        };
+        let hello = Hello { epoch, ..said_by(&"edge/robot-1".parse().unwrap(), Kind::Edge) };
         self.link_says(hello, version, vec![entry]);
     }
 
@@ -141,11 +136,8 @@ fn a_gateway_that_loses_the_inter_scope_is_none_until_it_works() {
 /// Alone in its scope nobody else could be on the inter scope for it.
 #[test]
 fn a_flow_without_a_group_stays_on_the_inter_scope() {
-    let mut bench = Bench::with(|config| ControlConfig {
-        inter_scope: true,
-        replicas: None,
-        ..config
-    });
+    let mut bench =
+        Bench::with(|config| ControlConfig { inter_scope: true, replicas: None, ..config });
     bench.core.lost(bench.now);
     assert_eq!(bench.core.stage(), Stage::Gateway);
 }
@@ -163,11 +155,7 @@ fn rules_hold_for_requests_of_other_flows_and_change_while_the_flow_runs() {
     assert_eq!(bench.bridges(TOPIC), [""; 0]);
     let told = ("plan".to_owned(), "access_denied".to_owned());
     assert_eq!(bench.routes(TOPIC), [told], "the robot's flow hears why");
-    assert_eq!(
-        bench.core.registry().lease_count(),
-        1,
-        "the publisher is none of theirs"
-    );
+    assert_eq!(bench.core.registry().lease_count(), 1, "the publisher is none of theirs");
     bench.core.set_access(bench.now, 0, AccessRules::default());
     bench.step(300);
     assert_eq!(bench.bridges(TOPIC).len(), 1);
@@ -280,10 +268,7 @@ fn a_gateway_that_alone_reaches_nobody_leaves_the_work_to_others() {
     pass(&mut bench, 10, 1);
     assert_eq!(bench.own().1, Role::Gateway);
     let down = LinkEvent::PeerDown {
-        endpoint: Endpoint {
-            flow: robot.clone(),
-            epoch: 1,
-        },
+        endpoint: Endpoint { flow: robot.clone(), epoch: 1 },
         reason: DownReason::Silent,
     };
     bench.core.link_event(bench.now, down);
@@ -293,18 +278,14 @@ fn a_gateway_that_alone_reaches_nobody_leaves_the_work_to_others() {
     assert_eq!(bench.own().1, Role::Gateway, "a moment says nothing");
     pass(&mut bench, 20, 1);
     assert_eq!(bench.own(), (AutoBool::No, Role::Member));
-    assert!(
-        bench.wishes().is_empty(),
-        "it stays on the inter scope, to notice when it works"
-    );
-    bench
-        .core
-        .link_event(bench.now, LinkEvent::PeerRecovered { flow: robot });
+    assert!(bench.wishes().is_empty(), "it stays on the inter scope, to notice when it works");
+    bench.core.link_event(bench.now, LinkEvent::PeerRecovered { flow: robot });
     pass(&mut bench, 10, 1);
     assert_eq!(bench.own(), (AutoBool::Yes, Role::Gateway));
 }
 
-/// It comes to the inter scope, where others that were there before it reach flows that it has not heard yet.
+/// It comes to the inter scope, where others that were there before it reach flows that it has not
+/// heard yet.
 #[test]
 fn whoever_comes_is_ready_when_it_is_a_gateway_and_not_before() {
     let robot: FlowId = "edge/robot-1".parse().unwrap();
@@ -327,25 +308,20 @@ fn whoever_comes_is_ready_when_it_is_a_gateway_and_not_before() {
         }
         if heard {
             bench.robot_announces(1, &["mapper"], false);
-            bench
-                .core
-                .link_event(bench.now, LinkEvent::PeerRecovered { flow: robot.clone() });
+            bench.core.link_event(bench.now, LinkEvent::PeerRecovered { flow: robot.clone() });
         }
         for _ in 0..6 {
             fog_2_reaches(&mut bench, 1);
             bench.wait(500);
         }
-        let expected = if heard {
-            (AutoBool::Auto, Role::Gateway)
-        } else {
-            (AutoBool::No, Role::Member)
-        };
+        let expected =
+            if heard { (AutoBool::Auto, Role::Gateway) } else { (AutoBool::No, Role::Member) };
         assert_eq!((bench.core.state(), bench.own()), (FlowState::Ready, expected));
     }
 }
 
-/// Images come over the link for a service here. That they are large decides of the connection on which they are written, and its own
-/// services say nothing of it.
+/// Images come over the link for a service here. That they are large decides of the connection on
+/// which they are written, and its own services say nothing of it.
 #[test]
 fn how_large_a_topic_is_that_only_others_publish_is_known_before_it_comes() {
     let mut bench = alone();
@@ -355,10 +331,7 @@ fn how_large_a_topic_is_that_only_others_publish_is_known_before_it_comes() {
         1,
         Entry {
             topic: TOPIC.into(),
-            node_advertise: Some(Advertise {
-                max_bytes: 921_600,
-                ..Advertise::default()
-            }),
+            node_advertise: Some(Advertise { max_bytes: 921_600, ..Advertise::default() }),
             ..Entry::default()
         },
     );

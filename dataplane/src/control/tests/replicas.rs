@@ -35,10 +35,7 @@ impl Bench {
 fn a_sign_of_life_that_says_nothing_new_is_no_reason_to_work() {
     let (mut bench, entries) = Bench::with_member();
     assert!(!bench.hear(member(1, &entries)));
-    let leaving = Hello {
-        state: State::Draining.into(),
-        ..member(1, &entries)
-    };
+    let leaving = Hello { state: State::Draining.into(), ..member(1, &entries) };
     assert!(bench.hear(leaving), "it goes");
 }
 
@@ -50,11 +47,7 @@ fn what_cannot_be_read_is_counted_and_does_no_harm() {
         assert!(!bench.core.replica_message(bench.now, read, None));
     }
     assert_eq!(bench.core.refused_replica_messages(), 3);
-    assert!(
-        !bench
-            .core
-            .replica_message(bench.now, Some(LinkControl::default()), None)
-    );
+    assert!(!bench.core.replica_message(bench.now, Some(LinkControl::default()), None));
 }
 
 #[test]

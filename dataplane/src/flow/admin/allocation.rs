@@ -30,9 +30,11 @@ pub(super) async fn allocation(State(shared): App) -> Json<Value> {
     let bandwidth = limiter.bandwidth();
     let body = json!({
         "limit_mbps": bandwidth.limit_mbps, "budget_bytes_per_s": bandwidth.limit_bytes_per_s(),
-        "measured_bytes_per_s": limiter.measured_bytes_per_s(None), "wire_factor": limiter.wire_factor(None).map(rounded_finely),
+        "measured_bytes_per_s": limiter.measured_bytes_per_s(None),
+        "wire_factor": limiter.wire_factor(None).map(rounded_finely),
         "feasible": limiter.last().is_none_or(|last| last.feasible), "share": bandwidth.share,
-        "wire_bytes": traffic.wire_bytes, "control_wire_bytes": traffic.control_bytes, "allocations": limiter.runs(),
+        "wire_bytes": traffic.wire_bytes, "control_wire_bytes": traffic.control_bytes,
+        "allocations": limiter.runs(),
         "topics": topics, "links": links,
     });
     drop(limiter);
@@ -44,9 +46,8 @@ fn facts(shared: &Shared, now: Instant) -> Vec<TopicFacts> {
     let mut all = Vec::new();
     let mut after = None;
     loop {
-        let (some, last) = shared
-            .plane
-            .read(|state| state.core.allocation_facts(now, after, AT_ONCE));
+        let (some, last) =
+            shared.plane.read(|state| state.core.allocation_facts(now, after, AT_ONCE));
         all.extend(some);
         if last.is_none() {
             return all;
@@ -55,7 +56,12 @@ fn facts(shared: &Shared, now: Instant) -> Vec<TopicFacts> {
     }
 }
 
-fn link_row(now: Instant, layer: &LayerName, traffic: Option<&mut LayerTraffic>, limiter: &Limiter) -> Value {
+fn link_row(
+    now: Instant,
+    layer: &LayerName,
+    traffic: Option<&mut LayerTraffic>,
+    limiter: &Limiter,
+) -> Value {
     let last = limiter.last();
     let wire_bytes_per_s = traffic.map_or(0.0, |traffic| traffic.rate.rate(now).1);
     json!({
@@ -74,7 +80,8 @@ fn topic_row(topic: &TopicFacts) -> Value {
     json!({
         "topic": topic.name, "class": granted.class.as_str(), "size_bytes": granted.size_bytes,
         "compression": compression(topic), "advertised_hz": rounded(granted.advertised_hz),
-        "published_hz": rounded(topic.published_hz), "lanes": topic.lanes.iter().map(lane_row).collect::<Vec<_>>(),
+        "published_hz": rounded(topic.published_hz),
+        "lanes": topic.lanes.iter().map(lane_row).collect::<Vec<_>>(),
     })
 }
 
@@ -85,17 +92,21 @@ fn compression(topic: &TopicFacts) -> Value {
         return Value::Null;
     }
     json!({
-        "level": topic.level, "messages": press.messages, "bytes_before": press.before, "bytes_after": press.after,
+        "level": topic.level, "messages": press.messages, "bytes_before": press.before,
+        "bytes_after": press.after,
         "ratio": rounded(press.after as f64 / press.before.max(1) as f64),
-        "cpu_ms": rounded(press.seconds * 1e3 / press.messages as f64), "as_it_is": topic.level == 0,
+        "cpu_ms": rounded(press.seconds * 1e3 / press.messages as f64),
+        "as_it_is": topic.level == 0,
     })
 }
 
 fn lane_row(lane: &LaneFacts) -> Value {
     json!({
-        "layer": lane.receiver.layer, "flow": lane.receiver, "allocated_hz": lane.allocated_hz.map(rounded_finely),
+        "layer": lane.receiver.layer, "flow": lane.receiver,
+        "allocated_hz": lane.allocated_hz.map(rounded_finely),
         "actual_hz": rounded(lane.actual_hz), "asked_hz": lane.asked_hz, "limited": lane.limited,
-        "exceeds_advertised": lane.exceeds_advertised, "skipped": lane.skipped, "queued": lane.queued,
+        "exceeds_advertised": lane.exceeds_advertised, "skipped": lane.skipped,
+        "queued": lane.queued,
         "wait_ms": {"p50": lane.waits.quantile_ms(0.5), "p99": lane.waits.quantile_ms(0.99)},
     })
 }
@@ -125,7 +136,8 @@ mod tests {
         limiter.run(Instant::now(), &[]);
         let row = link_row(Instant::now(), &cloud, None, &limiter);
         let expected = json!({
-            "layer": "cloud", "limit_bytes_per_s": 1_048_576.0, "measured_bytes_per_s": null, "wire_factor": null,
+            "layer": "cloud", "limit_bytes_per_s": 1_048_576.0, "measured_bytes_per_s": null,
+            "wire_factor": null,
             "load_bytes_per_s": null, "feasible": true, "wire_bytes_per_s": 0.0,
         });
         assert_eq!(row, expected);

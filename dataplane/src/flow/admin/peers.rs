@@ -18,9 +18,7 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
     let now = Instant::now();
     let (peers, refused) = shared.plane.read(|state| {
         let engine = state.engine.as_ref();
-        engine
-            .map(|engine| (engine.peers(), engine.waiting_peers()))
-            .unwrap_or_default()
+        engine.map(|engine| (engine.peers(), engine.waiting_peers())).unwrap_or_default()
     });
     let control = shared.control.lock();
     let rows: Vec<Value> = peers
@@ -29,13 +27,15 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
             json!({
                 "flow": peer.flow, "layer": peer.flow.layer, "kind": peer.kind, "epoch": peer.epoch,
                 "version": peer.version, "state": peer.state,
-                "last_heard_ms": peer.last_heard.map(|at| rounded(now.saturating_duration_since(at).as_secs_f64() * 1e3)),
+                "last_heard_ms": peer.last_heard
+                    .map(|at| rounded(now.saturating_duration_since(at).as_secs_f64() * 1e3)),
                 "rtt_ms": peer.rtt.map(|rtt| rounded(rtt.as_secs_f64() * 1e3)),
                 "clock_offset_ms": peer.clock_offset_ns.map(|ns| rounded(ns as f64 / 1e6)),
                 "clock_error_ms": peer.clock_error.map(|error| rounded(error.as_secs_f64() * 1e3)),
                 "loss": rounded(peer.loss), "address": control.address_of(&peer.flow),
                 "in_step": control.registry().is_in_step_with(&peer.flow),
-                "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes, "queue_bytes": peer.queue_bytes,
+                "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes,
+                "queue_bytes": peer.queue_bytes,
                 "receiving_bytes_per_s": peer.receiving_bytes_per_s.round(),
                 "queueing_delay_ms": rounded(peer.queueing_delay.as_secs_f64() * 1e3),
                 "capacity": peer.capacity.map(|capacity| json!({
@@ -45,28 +45,24 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
             })
         })
         .collect();
-    let replicas: Vec<Value> = control
-        .registry()
-        .replicas(now)
-        .map(|row| replica_row(&control, row))
-        .collect();
+    let replicas: Vec<Value> =
+        control.registry().replicas(now).map(|row| replica_row(&control, row)).collect();
     let gateways: Vec<&FlowId> = control.gateways().collect();
     let own = control.world().own();
     let gateway = json!({
-        "setting": own.map(|own| setting(own.gateway)), "stage": control.stage().as_str(), "gateways": gateways,
+        "setting": own.map(|own| setting(own.gateway)), "stage": control.stage().as_str(),
+        "gateways": gateways,
     });
     drop(control);
     let status = shared.inter.as_ref().and_then(InterScope::status);
     let link = status.map(|status| {
         json!({
-            "endpoints": status.endpoints, "addresses": status.addresses, "participants_rebuilt": status.rebuilds,
+            "endpoints": status.endpoints, "addresses": status.addresses,
+            "participants_rebuilt": status.rebuilds,
             "most_peers": MAX_PEERS, "refused": refused,
         })
     });
-    answer(
-        &shared,
-        json!({"peers": rows, "replicas": replicas, "gateway": gateway, "link": link}),
-    )
+    answer(&shared, json!({"peers": rows, "replicas": replicas, "gateway": gateway, "link": link}))
 }
 
 /// A flow that shares the layer broker, as it is heard there.
@@ -80,7 +76,8 @@ fn replica_row(control: &ControlCore, (flow, silent): (&FlowId, Duration)) -> Va
     let carries = parts.filter(|part| part.carrying == Carrying::Carries).count();
     json!({
         "flow": flow, "epoch": view.map(|view| view.epoch), "state": state,
-        "settled": view.is_some_and(|view| view.settled), "last_heard_ms": rounded(silent.as_secs_f64() * 1e3),
+        "settled": view.is_some_and(|view| view.settled),
+        "last_heard_ms": rounded(silent.as_secs_f64() * 1e3),
         "in_step": control.registry().is_in_step_with(flow), "carries": carries,
         "load": control.registry().load_of(flow).map(|load| json!({
             "out_bytes_per_s": load.out_bytes_per_s, "in_bytes_per_s": load.in_bytes_per_s,

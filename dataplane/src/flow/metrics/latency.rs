@@ -3,9 +3,8 @@
 use crate::lane::path::BridgeState;
 
 /// Upper bounds of the latency buckets in seconds.
-const BUCKETS: [f64; 14] = [
-    0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0,
-];
+const BUCKETS: [f64; 14] =
+    [0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
 
 /// A latency histogram as Prometheus counts: cumulative, in seconds.
 #[derive(Default)]

@@ -47,19 +47,10 @@ struct Pair {
 
 fn plane(me: &str) -> Arc<Plane> {
     let me: FlowId = me.parse().unwrap();
-    let mut core = DataCore::new(DataConfig {
-        me: me.clone(),
-        epoch: 1,
-        large_bytes: 65_536,
-        salt: 1,
-    });
+    let mut core =
+        DataCore::new(DataConfig { me: me.clone(), epoch: 1, large_bytes: 65_536, salt: 1 });
     core.set_compression(CompressionRules {
-        base: Compression {
-            codec: Codec::Lz4,
-            level: 1,
-            min_bytes: 65_536,
-            adaptive: false,
-        },
+        base: Compression { codec: Codec::Lz4, level: 1, min_bytes: 65_536, adaptive: false },
         topics: Vec::new(),
     });
     let config = EngineConfig {
@@ -75,15 +66,8 @@ fn plane(me: &str) -> Arc<Plane> {
 
 /// Gives a flow one bridge of the topic.
 fn connect(plane: &Plane, from: Scope, to: Target, publisher: &Arc<Collector>) -> TopicId {
-    let lane = LaneSpec {
-        reliable: true,
-        depth: 1,
-        ..LaneSpec::default()
-    };
-    let plan = TopicPlan {
-        bridges: vec![Bridge { from, to, lane }],
-        ..TopicPlan::default()
-    };
+    let lane = LaneSpec { reliable: true, depth: 1, ..LaneSpec::default() };
+    let plan = TopicPlan { bridges: vec![Bridge { from, to, lane }], ..TopicPlan::default() };
     plane.with(|state| {
         let now = Instant::now();
         let topic = state.core.intern(&"camera".parse().unwrap(), now).unwrap();
@@ -99,7 +83,8 @@ fn connect(plane: &Plane, from: Scope, to: Target, publisher: &Arc<Collector>) -
 
 /// Everything that one has to send to the other.
 fn carry(from: &Plane, to: &Plane) {
-    while let Next::Datagram(Transmit { class, datagram, .. }) = from.next_transmit(Duration::ZERO) {
+    while let Next::Datagram(Transmit { class, datagram, .. }) = from.next_transmit(Duration::ZERO)
+    {
         to.transport_event(TransportEvent::Received { class, datagram });
     }
 }
@@ -121,17 +106,13 @@ impl Pair {
         }
         robot.compress_by(1, on_threads(), run).unwrap();
         cloud.compress_with(2, on_threads()).unwrap();
-        let pair = Self {
-            robot,
-            cloud,
-            topic,
-            written,
-            sequence: 0,
-        };
+        let pair = Self { robot, cloud, topic, written, sequence: 0 };
         let receiver: FlowId = "cloud/cloud-1".parse().unwrap();
         eventually(|| {
             pair.carry();
-            let engine = |state: &mut PlaneState| state.engine.as_ref().map(|engine| engine.takes_lz4(&receiver));
+            let engine = |state: &mut PlaneState| {
+                state.engine.as_ref().map(|engine| engine.takes_lz4(&receiver))
+            };
             pair.robot.read(engine) == Some(true)
         });
         pair
@@ -145,11 +126,7 @@ impl Pair {
     /// One picture, all of this byte.
     fn publish(&mut self, byte: u8) {
         self.sequence += 1;
-        let origin = Origin {
-            layer: "edge".into(),
-            node: "robot-1".into(),
-            ..Origin::default()
-        };
+        let origin = Origin { layer: "edge".into(), node: "robot-1".into(), ..Origin::default() };
         let header = Header::new("camera", origin, WriterId([5; 16]), self.sequence, wall_ns());
         let received = Received {
             content: Content::Frame(Frame::new(&header, Bytes::from(vec![byte; BYTES])).unwrap()),
@@ -161,7 +138,8 @@ impl Pair {
         self.robot.ingest(self.topic, Scope::Node, &mut vec![received]);
     }
 
-    /// The first byte of each picture that the cloud has written, and the sequences are those that follow one another.
+    /// The first byte of each picture that the cloud has written, and the sequences are those that
+    /// follow one another.
     fn arrived(&self) -> Vec<u8> {
         let frames = self.written.0.lock();
         let ascend = frames.windows(2).all(|pair| pair[0].sequence() < pair[1].sequence());
@@ -176,8 +154,7 @@ impl Pair {
 
     fn dropped(&self, reason: DropReason) -> u64 {
         let topic = self.topic;
-        self.robot
-            .read(|state| state.core.path(topic).bridges[0].stats.dropped.get(reason))
+        self.robot.read(|state| state.core.path(topic).bridges[0].stats.dropped.get(reason))
     }
 }
 
@@ -188,7 +165,8 @@ fn pictures_cross_the_link_compressed_while_threads_come_and_go() {
         pair.publish(byte);
         pair.robot.codec().unwrap().resize(1 + usize::from(byte % 3)).unwrap();
         pair.cloud.codec().unwrap().resize(1 + usize::from(byte % 2)).unwrap();
-        // A publisher that the pool keeps up with: what waits for it is bounded, and what is beyond that would be dropped.
+        // A publisher that the pool keeps up with: what waits for it is bounded, and what is beyond
+        // that would be dropped.
         let waiting = |plane: &Plane| plane.read(|state| state.core.press_counters().waiting);
         eventually(|| {
             pair.carry();

@@ -85,19 +85,12 @@ impl Publisher for Collector {
         PublishOutcome::Taken
     }
     fn later(&self) -> Later {
-        Later {
-            queued: self.queued.load(Ordering::SeqCst),
-            ..Later::default()
-        }
+        Later { queued: self.queued.load(Ordering::SeqCst), ..Later::default() }
     }
 }
 
 fn lane_spec() -> LaneSpec {
-    LaneSpec {
-        depth: 1,
-        shared: Some(LayerScopeId::kafka("")),
-        ..LaneSpec::default()
-    }
+    LaneSpec { depth: 1, shared: Some(LayerScopeId::kafka("")), ..LaneSpec::default() }
 }
 
 fn lane_with(change: impl FnOnce(&mut LaneSpec)) -> LaneSpec {
@@ -107,10 +100,7 @@ fn lane_with(change: impl FnOnce(&mut LaneSpec)) -> LaneSpec {
 }
 
 fn planned(bridges: Vec<Bridge>) -> TopicPlan {
-    TopicPlan {
-        bridges,
-        ..TopicPlan::default()
-    }
+    TopicPlan { bridges, ..TopicPlan::default() }
 }
 
 fn writes_to(publisher: &Arc<impl Publisher + 'static>) -> Result<NewWriter, String> {
@@ -122,10 +112,7 @@ fn writes_to(publisher: &Arc<impl Publisher + 'static>) -> Result<NewWriter, Str
 
 fn to_cloud() -> Target {
     let layer: LayerName = "cloud".parse().unwrap();
-    Target::Inter {
-        receiver: "cloud/cloud-1".parse().unwrap(),
-        layer,
-    }
+    Target::Inter { receiver: "cloud/cloud-1".parse().unwrap(), layer }
 }
 
 struct Bench {
@@ -149,13 +136,7 @@ impl Bench {
         let mut core = DataCore::new(config);
         let now = Instant::now();
         let topic = core.intern(&"imu/data".parse().unwrap(), now).unwrap();
-        let mut bench = Self {
-            core,
-            link: NotingLink::default(),
-            out: Arc::default(),
-            topic,
-            now,
-        };
+        let mut bench = Self { core, link: NotingLink::default(), out: Arc::default(), topic, now };
         bench.apply(bridges, TopicInfo::default());
         bench
     }
@@ -185,12 +166,9 @@ impl Bench {
     }
 
     fn take_on(&mut self, topic: TopicId, from: Scope, contents: Vec<Content>) {
-        let mut batch: Vec<Received> = contents
-            .into_iter()
-            .map(|content| received(content, self.now))
-            .collect();
-        self.core
-            .ingest(self.now, WALL, topic, from, &mut batch, &mut self.link);
+        let mut batch: Vec<Received> =
+            contents.into_iter().map(|content| received(content, self.now)).collect();
+        self.core.ingest(self.now, WALL, topic, from, &mut batch, &mut self.link);
     }
 
     fn deliver(&mut self, frame: Frame) {
@@ -199,11 +177,7 @@ impl Bench {
 
     /// Sequences that the link got.
     fn submitted(&self) -> Vec<u64> {
-        self.link
-            .submitted
-            .iter()
-            .map(|(_, _, frame)| frame.sequence())
-            .collect()
+        self.link.submitted.iter().map(|(_, _, frame)| frame.sequence()).collect()
     }
 
     /// Sequences that the brokers got.
@@ -217,13 +191,7 @@ impl Bench {
 }
 
 fn received(content: Content, at: Instant) -> Received {
-    Received {
-        content,
-        at,
-        broker_age_us: 0,
-        kept: false,
-        place: None,
-    }
+    Received { content, at, broker_age_us: 0, kept: false, place: None }
 }
 
 fn message(origin: [&str; 3], writer: u8, sequence: u64, depth: u32, bytes: usize) -> Frame {
@@ -233,10 +201,8 @@ fn message(origin: [&str; 3], writer: u8, sequence: u64, depth: u32, bytes: usiz
         service: origin[2].into(),
         ..Origin::default()
     };
-    let header = Header {
-        depth,
-        ..Header::new("imu/data", origin, WriterId([writer; 16]), sequence, WALL)
-    };
+    let header =
+        Header { depth, ..Header::new("imu/data", origin, WriterId([writer; 16]), sequence, WALL) };
     Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap()
 }
 
@@ -251,26 +217,17 @@ fn from_fog(sequence: u64, depth: u32) -> Frame {
 }
 
 fn bare(payload: &'static str) -> Content {
-    Content::Bare {
-        payload: Bytes::from_static(payload.as_bytes()),
-        identity: None,
-    }
+    Content::Bare { payload: Bytes::from_static(payload.as_bytes()), identity: None }
 }
 
 fn bridge(from: Scope, to: Target) -> Bridge {
-    Bridge {
-        from,
-        to,
-        lane: lane_spec(),
-    }
+    Bridge { from, to, lane: lane_spec() }
 }
 
 #[test]
 fn a_message_of_this_node_goes_to_every_bridge_once() {
-    let mut bench = Bench::new(vec![
-        bridge(Scope::Node, Target::Layer),
-        bridge(Scope::Node, to_cloud()),
-    ]);
+    let mut bench =
+        Bench::new(vec![bridge(Scope::Node, Target::Layer), bridge(Scope::Node, to_cloud())]);
     let one = Content::Frame(frame(1, 1, "robot-1", 0, 10));
     bench.take(Scope::Node, vec![one.clone(), one]);
     assert_eq!(bench.link.submitted.len(), 1);
@@ -283,7 +240,8 @@ fn a_message_of_this_node_goes_to_every_bridge_once() {
 
 #[test]
 fn what_is_not_from_here_stays_here() {
-    let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Layer, to_cloud())]);
+    let mut bench =
+        Bench::new(vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Layer, to_cloud())]);
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "edge-2", 0, 1))]);
     assert_eq!(
         bench.drops(),
@@ -291,19 +249,13 @@ fn what_is_not_from_here_stays_here() {
         "another node's message on this node scope"
     );
     bench.take(Scope::Layer, vec![Content::Frame(frame(2, 1, "edge-2", 1, 1))]);
-    assert!(
-        bench.link.submitted.is_empty(),
-        "what a flow wrote to the layer does not leave it"
-    );
+    assert!(bench.link.submitted.is_empty(), "what a flow wrote to the layer does not leave it");
     bench.take(Scope::Layer, vec![Content::Frame(frame(2, 2, "edge-2", 0, 1))]);
-    assert_eq!(
-        bench.link.submitted.len(),
-        1,
-        "what a service of the layer published does"
-    );
+    assert_eq!(bench.link.submitted.len(), 1, "what a service of the layer published does");
 }
 
-/// What is refused leaves no trace in the duplicate window: its high number would make the real writer's ones old.
+/// What is refused leaves no trace in the duplicate window: its high number would make the real
+/// writer's ones old.
 #[test]
 fn a_foreign_message_does_not_silence_the_writer_whose_name_it_bears() {
     let bridges = || vec![bridge(Scope::Node, to_cloud())];
@@ -331,7 +283,8 @@ fn an_own_write_that_comes_back_is_an_echo() {
     assert_eq!(bench.out.frames.lock().len(), 1);
 }
 
-/// A flow that has just begun gets newer messages from one carrier, and then what the next one sends again.
+/// A flow that has just begun gets newer messages from one carrier, and then what the next one
+/// sends again.
 #[test]
 fn what_comes_over_the_link_behind_newer_messages_is_dropped() {
     let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
@@ -349,30 +302,22 @@ fn what_comes_over_the_link_behind_newer_messages_is_dropped() {
 
 #[test]
 fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
-    let bridges = vec![
-        bridge(Scope::Node, to_cloud()),
-        bridge(Scope::Node, Target::Node { bare: true }),
-    ];
+    let bridges =
+        vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Node, Target::Node { bare: true })];
     let mut bench = Bench::new(Vec::new());
     let of_service = |service: &str| BareInfo {
         encoding: "application/json".into(),
         service: service.into(),
         ..BareInfo::default()
     };
-    let info = TopicInfo {
-        node: of_service("imu"),
-        layer: of_service("another"),
-        ..TopicInfo::default()
-    };
+    let info =
+        TopicInfo { node: of_service("imu"), layer: of_service("another"), ..TopicInfo::default() };
     bench.apply(bridges, info);
     bench.take(Scope::Node, vec![bare("a"), bare("a")]);
     let sent: Vec<_> = bench.link.submitted.iter().map(|(_, _, frame)| frame.clone()).collect();
     assert_eq!(bench.submitted(), [1, 2], "equal payloads are two messages");
     assert_eq!(sent[0].origin_node(), "robot-1");
-    assert_eq!(
-        (sent[0].origin_service(), sent[0].encoding()),
-        ("imu", "application/json")
-    );
+    assert_eq!((sent[0].origin_service(), sent[0].encoding()), ("imu", "application/json"));
     assert_eq!(bench.out.bare.lock().len(), 2);
 }
 
@@ -380,10 +325,7 @@ fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
 fn refusing(origins: &[&str]) -> TopicInfo {
     let rules = access(&serde_json::json!([{"match": "imu/**", "advertise": {"deny": origins}}]));
     TopicInfo {
-        node: BareInfo {
-            service: "imu".into(),
-            ..BareInfo::default()
-        },
+        node: BareInfo { service: "imu".into(), ..BareInfo::default() },
         access: rules.of(&"imu/data".parse().unwrap()),
         ..TopicInfo::default()
     }
@@ -395,10 +337,7 @@ fn what_the_rules_refuse_is_told_apart_by_scope_and_from_what_is_of_elsewhere() 
     let mut bench = Bench::new(bridges());
     bench.apply(bridges(), refusing(&["edge/robot-1/imu", "fog"]));
     let (denied, foreign) = (frame(1, 1, "robot-1", 0, 1), frame(2, 1, "edge-2", 0, 1));
-    bench.take(
-        Scope::Node,
-        vec![Content::Frame(denied), Content::Frame(foreign), bare("a")],
-    );
+    bench.take(Scope::Node, vec![Content::Frame(denied), Content::Frame(foreign), bare("a")]);
     for sequence in 1..=3 {
         bench.deliver(from_fog(sequence, 0));
     }
@@ -426,18 +365,13 @@ fn what_the_rules_refuse_is_told_apart_by_scope_and_from_what_is_of_elsewhere() 
 #[test]
 fn what_is_kept_of_origins_that_may_not_publish_any_more_goes_nowhere() {
     for (info, copies) in [(TopicInfo::default(), 2), (refusing(&["fog"]), 1)] {
-        let durable = |to| Bridge {
-            lane: lane_with(|lane| lane.durable = true),
-            ..bridge(Scope::Inter, to)
-        };
+        let durable =
+            |to| Bridge { lane: lane_with(|lane| lane.durable = true), ..bridge(Scope::Inter, to) };
         let mut bench = Bench::new(vec![durable(Target::Layer)]);
         bench.core.deliver_waiting(bench.now, bench.topic, &mut bench.link);
         bench.deliver(from_fog(1, 1));
         assert_eq!(bench.out.frames.lock().len(), 1);
-        bench.apply(
-            vec![durable(Target::Layer), durable(Target::Node { bare: false })],
-            info,
-        );
+        bench.apply(vec![durable(Target::Layer), durable(Target::Node { bare: false })], info);
         bench.core.deliver_waiting(bench.now, bench.topic, &mut bench.link);
         assert_eq!(bench.out.frames.lock().len(), copies);
     }
@@ -446,10 +380,7 @@ fn what_is_kept_of_origins_that_may_not_publish_any_more_goes_nowhere() {
 #[test]
 fn garbage_is_counted() {
     let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);
-    bench.take(
-        Scope::Node,
-        vec![Content::from_bytes(Bytes::from_static(b"BLZ1\xff\xff\xff\xff"))],
-    );
+    bench.take(Scope::Node, vec![Content::from_bytes(Bytes::from_static(b"BLZ1\xff\xff\xff\xff"))]);
     let mut other = frame(1, 1, "robot-1", 0, 1).to_bytes().to_vec();
     let place = other.windows(8).position(|w| w == b"imu/data").unwrap();
     other[place] = b'x';
@@ -464,25 +395,16 @@ fn garbage_is_counted() {
 #[test]
 fn a_lane_is_thinned_and_old_messages_are_dropped() {
     let lane = lane_with(|lane| (lane.max_rate_hz, lane.lifespan_ms) = (Some(1.0), 100));
-    let mut bench = Bench::new(vec![Bridge {
-        from: Scope::Node,
-        to: to_cloud(),
-        lane,
-    }]);
-    bench.take(
-        Scope::Node,
-        (1..=5).map(|n| Content::Frame(frame(1, n, "robot-1", 0, 1))).collect(),
-    );
+    let mut bench = Bench::new(vec![Bridge { from: Scope::Node, to: to_cloud(), lane }]);
+    bench
+        .take(Scope::Node, (1..=5).map(|n| Content::Frame(frame(1, n, "robot-1", 0, 1))).collect());
     let old = frame(1, 6, "robot-1", 0, 1).with_hops_and_age(0, 100_001);
     bench.take(Scope::Node, vec![Content::Frame(old)]);
     let stats = &bench.core.path(bench.topic).bridges[0].stats;
     assert_eq!(bench.link.submitted.len(), 2);
     assert_eq!(stats.dropped.get(DropReason::MaxRate), 3);
     assert_eq!(stats.dropped.get(DropReason::Lifespan), 1);
-    assert_eq!(
-        stats.taken.messages,
-        stats.out.messages + stats.dropped.total() + stats.queued()
-    );
+    assert_eq!(stats.taken.messages, stats.out.messages + stats.dropped.total() + stats.queued());
 }
 
 #[test]
@@ -504,10 +426,7 @@ fn a_bridge_that_is_no_longer_planned_drains_and_comes_back_with_its_counters() 
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 2, "robot-1", 0, 1))]);
     assert_eq!(bench.link.submitted.len(), 1, "it takes in nothing more");
     assert!(bench.drain().is_some(), "something is still queued");
-    assert!(
-        bench.core.drain(bench.now + DRAIN, &mut bench.link).is_none(),
-        "the deadline ends it"
-    );
+    assert!(bench.core.drain(bench.now + DRAIN, &mut bench.link).is_none(), "the deadline ends it");
     assert_eq!(bench.core.path(bench.topic).bridges[0].phase, Phase::Ended);
     bench.apply(vec![bridge(Scope::Node, to_cloud())], TopicInfo::default());
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 3, "robot-1", 0, 1))]);
@@ -516,10 +435,12 @@ fn a_bridge_that_is_no_longer_planned_drains_and_comes_back_with_its_counters() 
 }
 
 proptest! {
-    /// Whatever comes in, each message is either written, dropped with a reason or waiting; none twice; order is kept.
+    /// Whatever comes in, each message is either written, dropped with a reason or waiting; none
+    /// twice; order is kept.
     #[test]
     fn nothing_is_lost_without_a_count(
-        messages in proptest::collection::vec((0u8..3, 1u64..40, any::<bool>(), 0u64..200_000), 1..200),
+        messages in proptest::collection::vec((0u8..3, 1u64..40, any::<bool>(), 0u64..200_000),
+            1..200),
         refuse: bool,
         reliable: bool,
     ) {
@@ -538,7 +459,10 @@ proptest! {
         for bridge in &mut bench.core.path_mut(bench.topic).bridges {
             bridge.settle();
             let stats = &bridge.stats;
-            prop_assert_eq!(stats.taken.messages, stats.out.messages + stats.dropped.total() + stats.queued());
+            prop_assert_eq!(
+                stats.taken.messages,
+                stats.out.messages + stats.dropped.total() + stats.queued(),
+            );
         }
         let mut seen = std::collections::HashSet::new();
         for frame in bench.out.frames.lock().iter() {
@@ -611,13 +535,7 @@ impl Bench {
             stats.out.messages + stats.dropped.total() + stats.queued()
         );
         let (too_large, lifespan) = (dropped(DropReason::TooLarge), dropped(DropReason::Lifespan));
-        (
-            stats.taken.messages,
-            stats.out.messages,
-            too_large,
-            lifespan,
-            stats.queued(),
-        )
+        (stats.taken.messages, stats.out.messages, too_large, lifespan, stats.queued())
     }
 }
 
@@ -676,10 +594,7 @@ fn a_bridge_that_ends_keeps_its_writer_until_all_is_delivered() {
     assert!(!ended(&bench) && Arc::strong_count(&adapter) == 2);
     let name: TopicName = "imu/data".parse().unwrap();
     let held = bench.core.writer_of(&name, Scope::Node, &Target::Layer).cloned();
-    assert!(
-        held.is_some(),
-        "if it comes back it goes on with the same queue, in order"
-    );
+    assert!(held.is_some(), "if it comes back it goes on with the same queue, in order");
     drop(held);
     adapter.settle(3, 1, 0);
     bench.core.mark();
@@ -692,7 +607,9 @@ fn a_bridge_without_a_writer_has_failed_and_reads_nothing() {
     let mut bench = Bench::new(Vec::new());
     bench.write_with(Err("no such name"));
     let failed = bench.core.path(bench.topic).bridges[0].phase;
-    assert!(matches!(failed, Phase::Failed { .. }) && !bench.core.path(bench.topic).reads(Scope::Node));
+    assert!(
+        matches!(failed, Phase::Failed { .. }) && !bench.core.path(bench.topic).reads(Scope::Node)
+    );
     bench.now += Duration::from_secs(5);
     bench.write_with(Err("still none"));
     let found = &bench.core.path(bench.topic).bridges[0];
@@ -713,7 +630,8 @@ fn a_bridge_without_a_writer_has_failed_and_reads_nothing() {
 
 #[test]
 fn bare_copies_are_made_of_what_comes_from_anywhere() {
-    let bridges = [Scope::Node, Scope::Layer, Scope::Inter].map(|from| bridge(from, Target::Node { bare: true }));
+    let bridges = [Scope::Node, Scope::Layer, Scope::Inter]
+        .map(|from| bridge(from, Target::Node { bare: true }));
     let mut bench = Bench::new(bridges.into());
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
     bench.take(Scope::Layer, vec![Content::Frame(frame(2, 1, "edge-2", 1, 2))]);
@@ -762,11 +680,7 @@ fn a_forgotten_topic_leaves_its_lanes_and_windows_to_others() {
     bench.topic = bench.core.intern(&"imu/data".parse().unwrap(), bench.now).unwrap();
     bench.apply(vec![bridge(Scope::Node, to_cloud())], TopicInfo::default());
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
-    assert_eq!(
-        bench.link.submitted.len(),
-        2,
-        "the window of the topic that was is gone"
-    );
+    assert_eq!(bench.link.submitted.len(), 2, "the window of the topic that was is gone");
     assert_eq!(bench.link.submitted[1].0, lane);
     bench.core.lane_out(lane, 1, 1);
     assert_eq!(bench.core.path(bench.topic).bridges[0].stats.out.messages, 1);
@@ -810,20 +724,17 @@ fn a_bridge_takes_the_place_of_one_that_ended_long_ago() {
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
     let (lane, _, _) = bench.link.submitted[0];
     bench.core.lane_out(lane, 1, 1);
-    let live = bench
-        .core
-        .path(bench.topic)
-        .bridges
-        .iter()
-        .find(|bridge| bridge.target == to(99));
+    let live = bench.core.path(bench.topic).bridges.iter().find(|bridge| bridge.target == to(99));
     assert_eq!(live.unwrap().stats.out.messages, 1);
 }
 
 proptest! {
-    /// Whatever an adapter does with what it took, everything is counted once and nothing that was out comes back.
+    /// Whatever an adapter does with what it took, everything is counted once and nothing that was
+    /// out comes back.
     #[test]
     fn late_drops_keep_the_counts(
-        steps in proptest::collection::vec((0u64..20, 0u64..20, 0u64..5, 0u64..5, any::<bool>()), 1..60),
+        steps in proptest::collection::vec((0u64..20, 0u64..20, 0u64..5, 0u64..5, any::<bool>()),
+            1..60),
     ) {
         let mut bench = Bench::new(Vec::new());
         let mut adapters = vec![Arc::new(Adapter::default())];

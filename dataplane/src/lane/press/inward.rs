@@ -58,10 +58,8 @@ impl DataCore {
         };
         // It holds the one, and then the other.
         let bytes = found.max(size);
-        let pushed = self
-            .press
-            .into
-            .push_waiting(line, Urgency::Quick, Box::new(message), bytes, 0);
+        let pushed =
+            self.press.into.push_waiting(line, Urgency::Quick, Box::new(message), bytes, 0);
         if pushed.refused.is_some() {
             self.press.refused += 1;
             self.refuse_pressed(line.0, DropReason::QueueFull);
@@ -101,7 +99,13 @@ impl DataCore {
         }
     }
 
-    fn deliver_pressed(&mut self, now: Instant, topic: TopicId, message: &Admitted, link: &mut dyn LaneLink) {
+    fn deliver_pressed(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        message: &Admitted,
+        link: &mut dyn LaneLink,
+    ) {
         if !self.topics[topic.0 as usize].delivers() {
             // Its bridges have ended while it was with the codec.
             self.refuse_pressed(topic, DropReason::NoDestination);

@@ -1,4 +1,5 @@
-//! At which level the payloads of a topic are compressed, what came of it, and how large they are as sent.
+//! At which level the payloads of a topic are compressed, what came of it, and how large they are
+//! as sent.
 
 use std::time::Instant;
 
@@ -68,7 +69,9 @@ impl TopicPath {
 
     /// Whether the rule wants a payload of that size to be compressed.
     pub(super) fn is_worth(&self, bytes: usize) -> bool {
-        self.compression.codec == Codec::Lz4 && bytes > 0 && bytes >= self.compression.min_bytes as usize
+        self.compression.codec == Codec::Lz4
+            && bytes > 0
+            && bytes >= self.compression.min_bytes as usize
     }
 
     /// Another rule: what was found out by the one before holds no more.
@@ -80,8 +83,9 @@ impl TopicPath {
         }
     }
 
-    /// Notes a payload that is worth compressing as it is sent, and at which level that is; 0: as it is. At a higher level than before they
-    /// become smaller, and the largest of before says nothing any more. Returns whether the largest is another one.
+    /// Notes a payload that is worth compressing as it is sent, and at which level that is; 0: as
+    /// it is. At a higher level than before they become smaller, and the largest of before says
+    /// nothing any more. Returns whether the largest is another one.
     pub(super) fn note_sent(&mut self, now: Instant, bytes: usize, level: u8) -> bool {
         if level > self.sent_level {
             self.sent_size = SizeMeter::default();

@@ -29,7 +29,8 @@ pub(super) struct Outward {
 }
 
 impl BridgeState {
-    /// A message of it goes to the codec. It is counted as taken when it leaves there: it may go to another bridge.
+    /// A message of it goes to the codec. It is counted as taken when it leaves there: it may go to
+    /// another bridge.
     fn goes_to_press(&mut self, bytes: u64) {
         self.pressing += 1;
         self.stats.taken.remove(bytes);
@@ -48,11 +49,13 @@ impl BridgeState {
 }
 
 impl TopicPath {
-    /// So many large messages of a writer wait for the codec at most; 0: only bytes count. A message is compressed for all lanes at once, so
-    /// none gives way as long as one lane keeps all.
+    /// So many large messages of a writer wait for the codec at most; 0: only bytes count. A
+    /// message is compressed for all lanes at once, so none gives way as long as one lane keeps
+    /// all.
     fn keep_newest(&self) -> usize {
         let lanes = self.bridges.iter().filter(|bridge| {
-            bridge.lane_id().is_some() && matches!(bridge.phase, Phase::Up { .. } | Phase::Draining { .. })
+            bridge.lane_id().is_some()
+                && matches!(bridge.phase, Phase::Up { .. } | Phase::Draining { .. })
         });
         let keeps = lanes.map(BridgeState::keep_newest);
         keeps
@@ -85,16 +88,10 @@ impl DataCore {
         }
         let is_large = lanes.iter().any(|(_, waiting)| waiting.large);
         let keep = if is_large { path.keep_newest() } else { 0 };
-        let urgency = if is_large || bytes > QUICK_BYTES {
-            Urgency::Long
-        } else {
-            Urgency::Quick
-        };
+        let urgency = if is_large || bytes > QUICK_BYTES { Urgency::Long } else { Urgency::Quick };
         let refused = if let Some(level) = level {
-            let pushed = self
-                .press
-                .out
-                .push_waiting(line, urgency, Outward { level, lanes }, bytes, keep);
+            let pushed =
+                self.press.out.push_waiting(line, urgency, Outward { level, lanes }, bytes, keep);
             for out in &pushed.gave_way {
                 self.lose(topic, out, DropReason::QueueFull);
             }
@@ -126,7 +123,8 @@ impl DataCore {
         link: &dyn LaneLink,
     ) -> Option<u8> {
         let path = &mut self.topics[topic.0 as usize];
-        let takes = |path: &TopicPath| lanes.iter().any(|(at, _)| path.bridges[*at].takes_lz4(link));
+        let takes =
+            |path: &TopicPath| lanes.iter().any(|(at, _)| path.bridges[*at].takes_lz4(link));
         if !self.press.enabled || !path.is_worth(bytes) || !takes(path) {
             return None;
         }
@@ -134,8 +132,15 @@ impl DataCore {
         path.effort.next(now, path.compression)
     }
 
-    /// Notes the size of a message that a lane could send: of one that is compressed that is known when it has been.
-    pub(in crate::lane) fn note_size(&mut self, now: Instant, topic: TopicId, bytes: usize, link: &dyn LaneLink) {
+    /// Notes the size of a message that a lane could send: of one that is compressed that is known
+    /// when it has been.
+    pub(in crate::lane) fn note_size(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        bytes: usize,
+        link: &dyn LaneLink,
+    ) {
         let path = &mut self.topics[topic.0 as usize];
         if !self.press.enabled || !path.is_worth(bytes) {
             self.allocation_due |= path.sent_size.note(now, bytes as u64);
@@ -198,7 +203,8 @@ impl DataCore {
                 if !path.bridges[*at].takes_lz4(link) {
                     level = 0;
                 } else if let Some(block) = &done.block
-                    // Only a header without room for the new fields cannot take it: then it goes as it is.
+                    // Only a header without room for the new fields cannot take it: then it goes as
+                    // it is.
                     && let Ok(frame) = waiting.frame.compressed(block.clone(), done.before as u64)
                 {
                     waiting.frame = frame;

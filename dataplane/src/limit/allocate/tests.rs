@@ -1,31 +1,19 @@
-//! Sets that were worked out by hand. Random ones are compared with exact arithmetic in `tests/allocation`.
+//! Sets that were worked out by hand. Random ones are compared with exact arithmetic in
+//! `tests/allocation`.
 
 use super::*;
 
 fn topic(name: &str, size_bytes: u64, advertised_hz: f64) -> Topic<'_> {
-    Topic {
-        name,
-        size_bytes,
-        advertised_hz,
-        class: None,
-        lanes: vec![Lane { max_rate_hz: None }],
-    }
+    Topic { name, size_bytes, advertised_hz, class: None, lanes: vec![Lane { max_rate_hz: None }] }
 }
 
 /// No overhead, so that the numbers stay round.
 fn plain() -> Terms {
-    Terms {
-        overhead: 1.0,
-        ..Terms::default()
-    }
+    Terms { overhead: 1.0, ..Terms::default() }
 }
 
 fn rates(budget: f64, terms: &Terms, topics: &[Topic<'_>]) -> Vec<f64> {
-    allocate(budget, terms, topics)
-        .grants
-        .iter()
-        .map(|grant| grant.rate_hz)
-        .collect()
+    allocate(budget, terms, topics).grants.iter().map(|grant| grant.rate_hz).collect()
 }
 
 fn assert_near(got: &[f64], wanted: &[f64]) {
@@ -38,36 +26,29 @@ fn assert_near(got: &[f64], wanted: &[f64]) {
 
 #[test]
 fn small_topics_come_first_and_images_share_what_remains_by_demand() {
-    // 10 MB/s: the IMU takes 50 kB/s; the larger camera up to β · 10 MB/s less what the floor of the other needs, which gets its floor.
+    // 10 MB/s: the IMU takes 50 kB/s; the larger camera up to β · 10 MB/s less what the floor of
+    // the other needs, which gets its floor.
     let topics = [
         topic("camera/front", 1_000_000, 30.0),
         topic("imu", 1_000, 50.0),
         topic("camera/rear", 500_000, 30.0),
     ];
-    // Floor of the rear one: 2 · 500 kB = 1 MB/s, so the front one gets min(10 − 0.05 − 1, 9.5) MB/s.
+    // Floor of the rear one: 2 · 500 kB = 1 MB/s, so the front one gets min(10 − 0.05 − 1, 9.5)
+    // MB/s.
     assert_near(&rates(10e6, &plain(), &topics), &[8.95, 50.0, 2.0]);
 }
 
 #[test]
 fn no_topic_takes_more_than_its_share() {
     assert_near(&rates(10e6, &plain(), &[topic("camera", 1_000_000, 30.0)]), &[9.5]);
-    assert_near(
-        &rates(10e6, &plain(), &[topic("scan", 50_000, 1_000.0)]),
-        &[0.0095e6 / 50.0],
-    );
+    assert_near(&rates(10e6, &plain(), &[topic("scan", 50_000, 1_000.0)]), &[0.0095e6 / 50.0]);
 }
 
 #[test]
 fn fair_sharing_gives_equal_bytes_and_what_one_does_not_need_to_the_others() {
-    let fair = Terms {
-        sharing: Sharing::Fair,
-        ..plain()
-    };
-    let topics = [
-        topic("a", 1_000_000, 30.0),
-        topic("b", 500_000, 30.0),
-        topic("c", 100_000, 10.0),
-    ];
+    let fair = Terms { sharing: Sharing::Fair, ..plain() };
+    let topics =
+        [topic("a", 1_000_000, 30.0), topic("b", 500_000, 30.0), topic("c", 100_000, 10.0)];
     // c needs 1 MB/s; a and b get 4.5 MB/s each.
     assert_near(&rates(10e6, &fair, &topics), &[4.5, 9.0, 10.0]);
 }
@@ -78,9 +59,7 @@ fn lanes_are_filled_from_the_slowest() {
     camera.lanes = vec![
         Lane { max_rate_hz: None },
         Lane { max_rate_hz: Some(5.0) },
-        Lane {
-            max_rate_hz: Some(60.0),
-        },
+        Lane { max_rate_hz: Some(60.0) },
     ];
     // 2.5 MB/s are 25 copies a second: 5 for the slow lane, 10 for each of the others.
     let terms = Terms { share: 1.0, ..plain() };
@@ -92,11 +71,8 @@ fn lanes_are_filled_from_the_slowest() {
 
 #[test]
 fn a_stop_signal_is_not_starved_by_a_large_standard_topic() {
-    let topics = [
-        topic("points", 60_000, 100.0),
-        topic("stop", 100, 10.0),
-        topic("b", 60_000, 100.0),
-    ];
+    let topics =
+        [topic("points", 60_000, 100.0), topic("stop", 100, 10.0), topic("b", 60_000, 100.0)];
     let got = allocate(1e6, &plain(), &topics);
     assert!(!got.feasible);
     // The smallest first; b before points, because its name is; β caps each.
@@ -107,21 +83,14 @@ fn a_stop_signal_is_not_starved_by_a_large_standard_topic() {
 
 #[test]
 fn floors_that_exceed_the_budget_are_given_and_reported() {
-    let got = allocate(
-        1e6,
-        &plain(),
-        &[topic("a", 1_000_000, 30.0), topic("b", 1_000_000, 1.0)],
-    );
+    let got = allocate(1e6, &plain(), &[topic("a", 1_000_000, 30.0), topic("b", 1_000_000, 1.0)]);
     assert!(!got.feasible);
     assert_near(&[got.grants[0].rate_hz, got.grants[1].rate_hz], &[2.0, 1.0]);
 }
 
 #[test]
 fn equal_demands_are_served_by_name() {
-    let terms = Terms {
-        min_rate_hz: 0.0,
-        ..plain()
-    };
+    let terms = Terms { min_rate_hz: 0.0, ..plain() };
     let got = rates(1e6, &terms, &[topic("b", 100_000, 30.0), topic("a", 100_000, 30.0)]);
     assert_near(&got, &[0.5, 9.5]);
 }
@@ -131,25 +100,14 @@ fn nothing_is_gained_by_numbers_that_are_none() {
     let strange = [f64::NAN, f64::INFINITY, -1.0, 0.0];
     for number in strange {
         for budget in strange.into_iter().chain([1e6]) {
-            let terms = Terms {
-                overhead: number,
-                share: number,
-                min_rate_hz: number,
-                ..Terms::default()
-            };
+            let terms =
+                Terms { overhead: number, share: number, min_rate_hz: number, ..Terms::default() };
             let mut odd = topic("odd", u64::MAX, number);
-            odd.lanes.push(Lane {
-                max_rate_hz: Some(number),
-            });
-            let got = allocate(
-                budget,
-                &terms,
-                &[odd, topic("empty", 0, 10.0), topic("good", 100, 10.0)],
-            );
+            odd.lanes.push(Lane { max_rate_hz: Some(number) });
+            let got =
+                allocate(budget, &terms, &[odd, topic("empty", 0, 10.0), topic("good", 100, 10.0)]);
             assert!(
-                got.grants
-                    .iter()
-                    .all(|grant| grant.rate_hz.is_finite() && grant.rate_hz >= 0.0),
+                got.grants.iter().all(|grant| grant.rate_hz.is_finite() && grant.rate_hz >= 0.0),
                 "{number} {budget}: {got:?}"
             );
         }

@@ -1,10 +1,12 @@
 //! What a path does to datagrams: how long it takes, and what it loses.
 //!
-//! - Delay of the empty path: the least round trip of the last 30 to 60 s, as the base delay of LEDBAT (RFC 6817, 4.2).
-//! - A delay counts when each round trip of a while exceeds that by 25 ms, or by five times the jitter (smoothed as in
-//!   RFC 3550, 6.4.1). It must last, as the overuse of draft-ietf-rmcat-gcc: a pause of the receiver ends before.
-//! - Loss counts less than delay: radio loses without being full, and to send less does not help it. A bottleneck with
-//!   a queue of more than 25 ms shows a delay before it loses.
+//! - Delay of the empty path: the least round trip of the last 30 to 60 s, as the base delay of
+//!   LEDBAT (RFC 6817, 4.2).
+//! - A delay counts when each round trip of a while exceeds that by 25 ms, or by five times the
+//!   jitter (smoothed as in RFC 3550, 6.4.1). It must last, as the overuse of draft-ietf-rmcat-gcc:
+//!   a pause of the receiver ends before.
+//! - Loss counts less than delay: radio loses without being full, and to send less does not help
+//!   it. A bottleneck with a queue of more than 25 ms shows a delay before it loses.
 
 use std::time::{Duration, Instant};
 
@@ -14,7 +16,8 @@ const MOST_TOLERANCE: Duration = Duration::from_millis(150);
 /// How long and in how many samples it must do so.
 const LASTING: Duration = Duration::from_millis(120);
 const LASTING_SAMPLES: u32 = 4;
-/// A larger change from one sample to the next is a pause, and counts as jitter with no more than this.
+/// A larger change from one sample to the next is a pause, and counts as jitter with no more than
+/// this.
 const LARGEST_CHANGE: Duration = Duration::from_millis(35);
 /// Over what time it is measured what comes out of the queue, later on.
 const BLOCK: Duration = Duration::from_millis(300);
@@ -140,7 +143,9 @@ impl Run {
         let newest = tells.then(|| self.delivered / lasted.as_secs_f64());
         match (newest, self.carried) {
             // What is much less is not the same rate measured again.
-            (Some(newest), Some(before)) if newest > 0.8 * before => Some(f64::midpoint(newest, before)),
+            (Some(newest), Some(before)) if newest > 0.8 * before => {
+                Some(f64::midpoint(newest, before))
+            }
             (newest, before) => newest.or(before),
         }
     }
@@ -162,7 +167,8 @@ pub(super) struct Loss {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Lost {
     pub(super) share: f64,
-    /// Lesser share of this one and the one before: a rate that changed in between would be mistaken.
+    /// Lesser share of this one and the one before: a rate that changed in between would be
+    /// mistaken.
     pub(super) lasting: f64,
     /// In bytes per second.
     pub(super) delivered: f64,
@@ -170,13 +176,7 @@ pub(super) struct Lost {
 
 impl Loss {
     pub(super) fn new(now: Instant) -> Self {
-        Self {
-            since: now,
-            delivered: 0.0,
-            lost: 0.0,
-            previous: None,
-            ordinary: 0.0,
-        }
+        Self { since: now, delivered: 0.0, lost: 0.0, previous: None, ordinary: 0.0 }
     }
 
     /// Begins to count anew.

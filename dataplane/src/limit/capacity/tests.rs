@@ -33,12 +33,7 @@ fn back_s(simulator: &Simulator, from: f64, to: f64, rate: f64) -> f64 {
 /// Falls from `before` to `after`, with short and long queues, and with few and many Feedback.
 fn falls(limit: f64, before: f64, after: f64, delay: u64) {
     for (queue, samples) in [(250e3, u32::MAX), (250e3, 64), (8e6, u32::MAX), (8e6, 64)] {
-        let link = Link {
-            rate: before,
-            queue,
-            delay,
-            ..Link::default()
-        };
+        let link = Link { rate: before, queue, delay, ..Link::default() };
         let mut simulator = Simulator::new(limit, link, 1);
         simulator.samples = samples;
         simulator.run(10.0);
@@ -97,10 +92,7 @@ fn a_link_that_slides_away_is_followed() {
 #[test]
 fn a_bottleneck_with_hardly_a_queue_shows_in_its_loss() {
     for (queue, rate) in [(30e3, 5e6), (30e3, 15e6), (250e3, 15e6)] {
-        let link = Link {
-            queue,
-            ..Link::default()
-        };
+        let link = Link { queue, ..Link::default() };
         let mut simulator = Simulator::new(LIMIT, link, 3);
         simulator.run(10.0);
         simulator.link.rate = rate;
@@ -125,22 +117,16 @@ fn stays_at_the_limit(link: Link, change: impl FnOnce(&mut Simulator)) {
 fn a_link_that_carries_the_limit_is_never_throttled() {
     stays_at_the_limit(Link::default(), |_| {});
     stays_at_the_limit(Link::default(), |simulator| simulator.samples = 64);
-    let unsteady = Link {
-        delay: 50,
-        jitter: 20,
-        ..Link::default()
-    };
+    let unsteady = Link { delay: 50, jitter: 20, ..Link::default() };
     stays_at_the_limit(unsteady, |_| {});
 }
 
-/// Decision: loss that does not come with a delay says that the radio is bad, not that the link is full, and what is
-/// lost is sent again at the expense of the budget. To send less would lose the same share.
+/// Decision: loss that does not come with a delay says that the radio is bad, not that the link is
+/// full, and what is lost is sent again at the expense of the budget. To send less would lose the
+/// same share.
 #[test]
 fn nor_for_random_loss() {
-    let lossy = Link {
-        loss: 0.03,
-        ..Link::default()
-    };
+    let lossy = Link { loss: 0.03, ..Link::default() };
     stays_at_the_limit(lossy, |_| {});
 }
 
@@ -155,15 +141,13 @@ fn nor_for_pauses_of_a_busy_processor() {
 
 #[test]
 fn nor_because_little_is_offered() {
-    // A frame of 900 kB ten times a second, something small now and then, and a link slower than the limit.
+    // A frame of 900 kB ten times a second, something small now and then, and a link slower than
+    // the limit.
     stays_at_the_limit(Link::default(), |simulator| {
         simulator.demand = Demand::Bursts(900e3, 100);
     });
     stays_at_the_limit(Link::default(), |simulator| simulator.demand = Demand::Bursts(3e3, 700));
-    let slower = Link {
-        rate: 12e6,
-        ..Link::default()
-    };
+    let slower = Link { rate: 12e6, ..Link::default() };
     stays_at_the_limit(slower, |simulator| simulator.demand = Demand::Even(10e6));
 }
 
@@ -194,10 +178,7 @@ fn loss_that_does_not_go_away_is_taken_for_ordinary() {
 #[test]
 fn after_an_outage_the_rate_begins_low_and_doubles_each_second() {
     for delay in [25, 120] {
-        let link = Link {
-            delay,
-            ..Link::default()
-        };
+        let link = Link { delay, ..Link::default() };
         let mut simulator = Simulator::new(LIMIT, link, 3);
         let now = simulator.instant();
         simulator.capacity.outage(now);
@@ -217,10 +198,7 @@ fn after_an_outage_the_rate_begins_low_and_doubles_each_second() {
 #[test]
 fn slow_start_ends_at_what_the_link_carries() {
     for rate in [5e6, 250e3] {
-        let link = Link {
-            rate,
-            ..Link::default()
-        };
+        let link = Link { rate, ..Link::default() };
         let mut simulator = Simulator::new(LIMIT, link, 3);
         let now = simulator.instant();
         simulator.capacity.outage(now);
@@ -271,10 +249,7 @@ fn slow_start_does_not_begin_below_what_is_small() {
 
 #[test]
 fn what_small_needs_does_not_raise_a_rate_that_is_known() {
-    let link = Link {
-        rate: 250e3,
-        ..Link::default()
-    };
+    let link = Link { rate: 250e3, ..Link::default() };
     let mut simulator = Simulator::new(1e6, link, 3);
     for _ in 0..600 {
         simulator.run(0.1);
@@ -312,10 +287,7 @@ fn a_worse_path_with_a_longer_delay_and_loss_is_used_in_the_end() {
 #[test]
 fn a_bottleneck_on_a_longer_or_shorter_route_keeps_its_rate() {
     for delay in [10, 60, 120] {
-        let link = Link {
-            rate: 5e6,
-            ..Link::default()
-        };
+        let link = Link { rate: 5e6, ..Link::default() };
         let mut simulator = Simulator::new(LIMIT, link, 3);
         simulator.run(30.0);
         simulator.link.delay = delay;
@@ -389,10 +361,8 @@ fn it_holds_on_any_link() {
         simulator.demand = Demand::Endless;
         simulator.link.rate = slow;
         simulator.run(40.0);
-        let (sent, longest) = (
-            simulator.mean_sent(38.0, 70.0) / slow,
-            simulator.longest_queue(38.0, 70.0),
-        );
+        let (sent, longest) =
+            (simulator.mean_sent(38.0, 70.0) / slow, simulator.longest_queue(38.0, 70.0));
         assert!((0.83..=1.01).contains(&sent), "seed {seed}: {sent} of a slow link");
         assert!(longest <= 200.0, "seed {seed}: {longest} ms");
 
@@ -400,9 +370,6 @@ fn it_holds_on_any_link() {
         simulator.run(40.0);
         let back = back_s(&simulator, 70.0, 110.0, 0.95 * limit);
         assert!(back <= 30.0, "seed {seed}: {back} s");
-        assert!(
-            simulator.log.iter().all(|entry| entry.most_rate <= limit),
-            "seed {seed}"
-        );
+        assert!(simulator.log.iter().all(|entry| entry.most_rate <= limit), "seed {seed}");
     }
 }

@@ -1,10 +1,10 @@
 //! Whether a delay or a loss is ours: less is sent, and it is seen whether it goes.
 //!
-//! It cannot be seen from its size: a route may have become longer, or the traffic of others may stand in the way. Half
-//! of the delivered rate must shorten a queue of ours by half a second per second. What stays, also at a quarter, is
-//! the path's own from then on, and has cost about a second at these rates. It is what BBR does with ProbeRTT, but only
-//! when there is a reason. What shrinks is ours, so that a standing queue of ours does not pass for the delay of the
-//! path.
+//! It cannot be seen from its size: a route may have become longer, or the traffic of others may
+//! stand in the way. Half of the delivered rate must shorten a queue of ours by half a second per
+//! second. What stays, also at a quarter, is the path's own from then on, and has cost about a
+//! second at these rates. It is what BBR does with ProbeRTT, but only when there is a reason. What
+//! shrinks is ours, so that a standing queue of ours does not pass for the delay of the path.
 
 use std::time::{Duration, Instant};
 
@@ -71,7 +71,14 @@ pub(super) struct Drain {
 
 impl Drain {
     /// Begins; `shrinking` is by how many seconds per second a queue of ours becomes shorter.
-    pub(super) fn new(now: Instant, delay: &Delay, before: f64, carried: f64, trial: u32, shrinking: f64) -> Self {
+    pub(super) fn new(
+        now: Instant,
+        delay: &Delay,
+        before: f64,
+        carried: f64,
+        trial: u32,
+        shrinking: f64,
+    ) -> Self {
         Self {
             since: now,
             before,
@@ -83,7 +90,8 @@ impl Drain {
         }
     }
 
-    /// Looks at a new round trip; `sent` is how much is sent since the beginning, in bytes per second.
+    /// Looks at a new round trip; `sent` is how much is sent since the beginning, in bytes per
+    /// second.
     pub(super) fn judge(&mut self, now: Instant, delay: &Delay, sent: f64) -> Verdict {
         // The longer the queue lasts, the better is known what comes out of it.
         self.carried = delay.carried().unwrap_or(self.carried);
@@ -125,12 +133,7 @@ pub(super) struct Spare {
 
 impl Spare {
     pub(super) fn new(before: f64, lost: Lost) -> Self {
-        Self {
-            before,
-            carried: lost.delivered,
-            share: lost.share,
-            settled: false,
-        }
+        Self { before, carried: lost.delivered, share: lost.share, settled: false }
     }
 
     /// Looks at a new window; `ordinary` is the share that is lost anyway.

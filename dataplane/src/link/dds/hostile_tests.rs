@@ -1,4 +1,5 @@
-//! Hostile datagrams at all ports of a flow: it must go on, or be rebuilt, and serve others afterwards.
+//! Hostile datagrams at all ports of a flow: it must go on, or be rebuilt, and serve others
+//! afterwards.
 
 use std::net::{Ipv4Addr, UdpSocket};
 use std::process::Command;
@@ -31,7 +32,8 @@ fn impersonate(announcement: &[u8], prefix: &[u8], ports: &[u16], port: u16) -> 
     forged
 }
 
-/// Real datagrams of the flows of a domain: announcements, and what they tell a participant that announces itself.
+/// Real datagrams of the flows of a domain: announcements, and what they tell a participant that
+/// announces itself.
 fn capture(domain: u16) -> Vec<Vec<u8>> {
     let base = 7400 + 250 * domain;
     let ear = (1..12)
@@ -47,9 +49,8 @@ fn capture(domain: u16) -> Vec<Vec<u8>> {
         let (length, _) = ear.recv_from(&mut buffer).ok()?;
         Some(buffer[..length].to_vec())
     });
-    let ports: Vec<u16> = (0..12)
-        .flat_map(|slot| [base + 10 + 2 * slot, base + 11 + 2 * slot])
-        .collect();
+    let ports: Vec<u16> =
+        (0..12).flat_map(|slot| [base + 10 + 2 * slot, base + 11 + 2 * slot]).collect();
     let forged = impersonate(&announcement, b"impersonator", &ports, port);
     let mut captured = vec![announcement, forged.clone()];
     let begin = Instant::now();
@@ -72,7 +73,8 @@ fn user_data(prefix: &[u8]) -> Vec<Vec<u8>> {
     let submessage = |id: u8, flags: u8, fields: &[u8], payload: &[u8]| {
         let mut message = header.clone();
         message.extend_from_slice(&[id, flags]);
-        message.extend_from_slice(&u16::try_from(fields.len() + payload.len()).unwrap().to_le_bytes());
+        message
+            .extend_from_slice(&u16::try_from(fields.len() + payload.len()).unwrap().to_le_bytes());
         message.extend_from_slice(fields);
         message.extend_from_slice(payload);
         message
@@ -84,10 +86,7 @@ fn user_data(prefix: &[u8]) -> Vec<Vec<u8>> {
         b"\x01\0\0\0\x01\0\x10\0\x10\0\0\0",
     ]
     .concat();
-    vec![
-        submessage(0x15, 0x05, ids, payload),
-        submessage(0x16, 0x01, &fragment, payload),
-    ]
+    vec![submessage(0x15, 0x05, ids, payload), submessage(0x16, 0x01, &fragment, payload)]
 }
 
 /// A datagram that was changed in one of the ways that find faults in parsers.
@@ -131,25 +130,18 @@ fn mutate(random: &mut Random, captured: &[Vec<u8>]) -> Vec<u8> {
     datagram
 }
 
-/// Datagrams that make an unprotected RustDDS 0.15 allocate up to gigabytes each, in the name of every writer and reader
-/// of discovery that a participant has.
+/// Datagrams that make an unprotected RustDDS 0.15 allocate up to gigabytes each, in the name of
+/// every writer and reader of discovery that a participant has.
 fn bombs(prefix: &[u8], random: &mut Random) -> Vec<Vec<u8>> {
     let little = random.index(2) == 0;
     let half = |value: u16| {
-        if little {
-            value.to_le_bytes()
-        } else {
-            value.to_be_bytes()
-        }
+        if little { value.to_le_bytes() } else { value.to_be_bytes() }
     };
     let word = |value: u32| {
-        if little {
-            value.to_le_bytes()
-        } else {
-            value.to_be_bytes()
-        }
+        if little { value.to_le_bytes() } else { value.to_be_bytes() }
     };
-    let number = |value: u64| [word((value >> 32) as u32), word((value & 0xffff_ffff) as u32)].concat();
+    let number =
+        |value: u64| [word((value >> 32) as u32), word((value & 0xffff_ffff) as u32)].concat();
     let count = (random.next() & 0x7fff_ffff) as u32;
     let mut bombs = Vec::new();
     let mut add = |kind: u8, fields: &[&[u8]]| {
@@ -166,23 +158,11 @@ fn bombs(prefix: &[u8], random: &mut Random) -> Vec<Vec<u8>> {
         let ids = [&id[..], &[0xc7], &id[..], &[0xc2]].concat();
         let sequence = number(1 + random.next() % 1000);
         add(0x07, &[&ids, &number(1), &number(0x7fff_ffff), &word(count)]);
-        add(
-            0x07,
-            &[&ids, &number(1 << 40), &number((1 << 40) + (1 << 31)), &word(count)],
-        );
+        add(0x07, &[&ids, &number(1 << 40), &number((1 << 40) + (1 << 31)), &word(count)]);
         add(0x08, &[&ids, &number(1000), &number(0x7fff_0000), &word(0)]);
-        add(
-            0x12,
-            &[
-                &ids,
-                &sequence,
-                &word(0xffff_fff0),
-                &word(8),
-                &word(u32::MAX),
-                &word(count),
-            ],
-        );
-        let fragment = [&half(0)[..], &half(28), &ids, &sequence, &word(1), &half(1), &half(256)].concat();
+        add(0x12, &[&ids, &sequence, &word(0xffff_fff0), &word(8), &word(u32::MAX), &word(count)]);
+        let fragment =
+            [&half(0)[..], &half(28), &ids, &sequence, &word(1), &half(1), &half(256)].concat();
         add(0x16, &[&fragment, &word(0xffff_ff00), &[0; 256]]);
         add(0x16, &[&fragment, &word(256 << 20), &[0; 256]]);
     }
@@ -214,13 +194,10 @@ fn hostile_datagrams_do_not_end_a_flow() {
         .env(ALONE, "1")
         .output()
         .unwrap();
-    let [said, complaint] = [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
+    let [said, complaint] =
+        [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
     println!("{said}");
-    assert!(
-        output.status.success() && said.contains("1 passed"),
-        "{}: {complaint}",
-        output.status
-    );
+    assert!(output.status.success() && said.contains("1 passed"), "{}: {complaint}", output.status);
 }
 
 fn attack() {
@@ -247,9 +224,8 @@ fn attack() {
             let prefix = &known[random.index(known.len())];
             datagrams.extend(bombs(prefix, &mut random));
         }
-        for (datagram, port) in datagrams
-            .iter()
-            .flat_map(|it| targets.iter().map(move |port| (it, port)))
+        for (datagram, port) in
+            datagrams.iter().flat_map(|it| targets.iter().map(move |port| (it, port)))
         {
             attacker.send_to(datagram, (Ipv4Addr::LOCALHOST, *port)).ok();
             sent += 1;
@@ -262,7 +238,8 @@ fn attack() {
     let (after, most) = resident();
     let grown = most.saturating_sub(before) >> 20;
     let rebuilds = robot.transport.status().rebuilds + fog.transport.status().rebuilds;
-    // A participant that is made anew has no filter for some milliseconds, in which each bomb takes half a gigabyte.
+    // A participant that is made anew has no filter for some milliseconds, in which each bomb takes
+    // half a gigabyte.
     assert!(
         grown < if rebuilds > 0 { 8 * 1024 } else { 64 },
         "memory grew by {grown} MiB, {} MiB remain, {rebuilds} rebuilds",
@@ -286,7 +263,8 @@ fn attack() {
     });
     assert_eq!(robot.transport.status().detail, "");
     println!(
-        "{sent} datagrams from {} captured, seed {seed:#x}: {} rebuilds, robot now {life}, {filtered} \
+        "{sent} datagrams from {} captured, seed {seed:#x}: {} rebuilds, robot now {life}, \
+         {filtered} \
          filtered, memory {grown} MiB more",
         captured.len(),
         robot.transport.status().rebuilds

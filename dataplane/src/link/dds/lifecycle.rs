@@ -1,4 +1,5 @@
-//! The thread that owns the participant of a transport: it makes writers, watches over RustDDS and builds it anew.
+//! The thread that owns the participant of a transport: it makes writers, watches over RustDDS and
+//! builds it anew.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::net::{IpAddr, Ipv4Addr};
@@ -10,7 +11,8 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    DdsError, EndpointWatch, FoundReader, GuidPrefix, Illness, Participant, ParticipantConfig, Pulse, Reader, lay_aside,
+    DdsError, EndpointWatch, FoundReader, GuidPrefix, Illness, Participant, ParticipantConfig,
+    Pulse, Reader, lay_aside,
 };
 use blaze_domain::Priority;
 
@@ -28,10 +30,7 @@ pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
     thread::Builder::new()
         .name("dds-lifecycle".into())
         .spawn(move || Lifecycle::new(shared).run())
-        .map_err(|error| DdsError::Create {
-            what: "thread",
-            error: error.to_string(),
-        })
+        .map_err(|error| DdsError::Create { what: "thread", error: error.to_string() })
 }
 
 /// One life of the participant. Fields drop in this order: users first, the participant last.
@@ -146,7 +145,11 @@ impl Lifecycle {
         match Generation::start(&self.shared, &self.local) {
             Ok(generation) => {
                 self.shared.relay.set_participant(generation.participant.prefix());
-                tracing::info!(flow = %self.local, participant = ?generation.participant, "DDS participant started");
+                tracing::info!(
+                    flow = %self.local,
+                    participant = ?generation.participant,
+                    "DDS participant started",
+                );
                 let filter_weakness = generation.participant.filter_weakness();
                 self.generation = Some(generation);
                 self.built = now;
@@ -158,14 +161,16 @@ impl Lifecycle {
                 }
                 drop(status);
                 if self.had_life {
-                    (self.shared.config.sink)(TransportEvent::Rebuilt {
-                        epoch: self.local.epoch,
-                    });
+                    (self.shared.config.sink)(TransportEvent::Rebuilt { epoch: self.local.epoch });
                 }
                 self.had_life = true;
             }
             Err(error) => {
-                tracing::warn!(flow = %self.local, %error, "DDS participant cannot start, trying again");
+                tracing::warn!(
+                    flow = %self.local,
+                    %error,
+                    "DDS participant cannot start, trying again",
+                );
                 self.shared.status.lock().detail = error.to_string();
                 self.next_attempt = now + RETRY;
             }
@@ -186,9 +191,7 @@ impl Lifecycle {
             let wanted = self.shared.wanted.lock();
             let writers = self.shared.writers.read();
             let is_missing = |endpoint: &Endpoint, class: Priority| {
-                writers
-                    .get(endpoint)
-                    .is_none_or(|slots| slots[class as usize].is_none())
+                writers.get(endpoint).is_none_or(|slots| slots[class as usize].is_none())
             };
             let classes = |(endpoint, flags): (&Endpoint, &[bool; CLASSES])| {
                 let missing = Priority::ALL
@@ -206,7 +209,8 @@ impl Lifecycle {
                     let wanted = self.shared.wanted.lock();
                     if wanted.get(&endpoint).is_some_and(|flags| flags[class as usize]) {
                         let mut writers = self.shared.writers.write();
-                        writers.entry(endpoint).or_default()[class as usize] = Some(Arc::new(writer));
+                        writers.entry(endpoint).or_default()[class as usize] =
+                            Some(Arc::new(writer));
                     }
                 }
                 Err(error) => {
@@ -257,12 +261,7 @@ impl Generation {
                 note_readers(&watcher, &own, &mut known.lock(), &endpoints.readers);
             }),
         )?;
-        Ok(Self {
-            _watch: watch,
-            readers,
-            pulse,
-            participant,
-        })
+        Ok(Self { _watch: watch, readers, pulse, participant })
     }
 
     /// Why it must be replaced, if so.
@@ -323,7 +322,8 @@ fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[F
                 addresses.push(address);
             }
         }
-        // Another participant with this flow's name is a mistake of the operator; the engine tells it from Hello.
+        // Another participant with this flow's name is a mistake of the operator; the engine tells
+        // it from Hello.
         if endpoint != *own {
             let entry = found.entry(endpoint).or_insert((reader.participant, [false; CLASSES]));
             entry.1[class as usize] = true;

@@ -12,10 +12,7 @@ pub(super) struct Flow {
 }
 
 pub(super) fn endpoint(name: &str, epoch: u64) -> Endpoint {
-    Endpoint {
-        flow: name.parse().unwrap(),
-        epoch,
-    }
+    Endpoint { flow: name.parse().unwrap(), epoch }
 }
 
 pub(super) fn start(domain: u16, name: &str, epoch: u64) -> Flow {
@@ -34,11 +31,7 @@ pub(super) fn start(domain: u16, name: &str, epoch: u64) -> Flow {
         sink: Arc::new(move |event| log.lock().push(event)),
     })
     .unwrap();
-    Flow {
-        transport,
-        events,
-        endpoint: endpoint(name, epoch),
-    }
+    Flow { transport, events, endpoint: endpoint(name, epoch) }
 }
 
 /// A domain whose ports nobody holds; tests run side by side.
@@ -78,7 +71,9 @@ impl Flow {
     fn received(&self, class: Priority) -> Vec<Bytes> {
         let events = self.events.lock();
         let of_class = |event: &TransportEvent| match event {
-            TransportEvent::Received { class: of, datagram } if *of == class => Some(datagram.clone()),
+            TransportEvent::Received { class: of, datagram } if *of == class => {
+                Some(datagram.clone())
+            }
             _ => None,
         };
         events.iter().filter_map(of_class).collect()
@@ -125,10 +120,7 @@ fn a_listen_address_must_be_one_interface() {
             listen: bad.parse().unwrap(),
             ..start(free_domain(), "edge/robot-1", 1).transport.shared.config.clone()
         };
-        assert!(
-            matches!(DdsTransport::start(config), Err(DdsError::Address(_))),
-            "{bad}"
-        );
+        assert!(matches!(DdsTransport::start(config), Err(DdsError::Address(_))), "{bad}");
     }
 }
 
@@ -233,7 +225,8 @@ fn survives(fault: Fault) {
     println!("{fault:?}: rebuilt after {:?}", begin.elapsed());
     assert_eq!(epoch, 2);
     assert_eq!(robot.transport.status().rebuilds, 1);
-    // Both directions work again: the writers that were wanted are made anew, the new life is found.
+    // Both directions work again: the writers that were wanted are made anew, the new life is
+    // found.
     robot.reach(&fog, &fog.endpoint);
     let reborn = endpoint("edge/robot-1", 2);
     fog.wait_discovered(&reborn, DISCOVERY);

@@ -16,7 +16,8 @@ const DATA_FRAG: usize = 36;
 const FRAGMENT: usize = 256;
 /// Encapsulation, and the length of the sequence of octets.
 const PAYLOAD_HEADER: usize = 4 + 4;
-/// What RustDDS keeps free in a packet: its datagram budget is the MTU less 48, a DATA's payload that less 48.
+/// What RustDDS keeps free in a packet: its datagram budget is the MTU less 48, a DATA's payload
+/// that less 48.
 const BUDGET: usize = 48;
 const DATA_RESERVE: usize = 48;
 /// From an MTU to the largest sample that never fragments, reliable writers included.
@@ -28,8 +29,8 @@ const SMALLEST_MTU: usize = MIN_MTU as usize;
 const _: () = assert!(SMALLEST_MTU >= MIN_DATAGRAM_BYTES + PAYLOAD_HEADER - 4 + MTU_OVERHEAD);
 /// The MTU of Linux' loopback interface.
 const LOOPBACK_MTU: usize = 65_536;
-/// Datagrams between flows of one host: one packet of the loopback interface, and several fit in a default socket
-/// buffer (208 KiB).
+/// Datagrams between flows of one host: one packet of the loopback interface, and several fit in a
+/// default socket buffer (208 KiB).
 const LOOPBACK_DATAGRAM: usize = 32 * 1024;
 /// `whole`: RustDDS cuts it into fragments of 256 bytes, five to a packet.
 const WHOLE_DATAGRAM: usize = 60 * 1024;
@@ -52,17 +53,15 @@ impl Wire {
             (Chunking::Auto, true) => LOOPBACK_DATAGRAM,
             (Chunking::Whole, _) => WHOLE_DATAGRAM,
         };
-        Self {
-            mtu: if loopback { LOOPBACK_MTU } else { mtu },
-            max_datagram,
-        }
+        Self { mtu: if loopback { LOOPBACK_MTU } else { mtu }, max_datagram }
     }
 
     pub(crate) fn max_datagram_bytes(self) -> usize {
         self.max_datagram
     }
 
-    /// What datagrams become on the wire. Small ones that RustDDS happens to put into one packet take less.
+    /// What datagrams become on the wire. Small ones that RustDDS happens to put into one packet
+    /// take less.
     pub(crate) fn packets(self) -> PacketSize {
         let budget = self.mtu - BUDGET;
         let room = (budget - RTPS_HEADER).saturating_sub(DATA_FRAG);
@@ -77,8 +76,8 @@ impl Wire {
         }
     }
 
-    /// Bytes of the largest sample that may come in fragments: a datagram of this transport, or one packet of a flow
-    /// whose `mtu` is above that of its interface.
+    /// Bytes of the largest sample that may come in fragments: a datagram of this transport, or one
+    /// packet of a flow whose `mtu` is above that of its interface.
     pub(super) fn largest_sample(self) -> u32 {
         let sample = (PAYLOAD_HEADER + self.max_datagram).max(SMALLEST_LIMIT);
         u32::try_from(sample).unwrap_or(u32::MAX)
@@ -110,7 +109,8 @@ mod tests {
     #[test]
     fn a_whole_datagram_is_cut_into_fragments() {
         let wire = Wire::new(1500, Chunking::Whole, false);
-        // 6000 + 8 bytes: five fragments (1280 bytes) to a packet, the last packet takes up to 1396.
+        // 6000 + 8 bytes: five fragments (1280 bytes) to a packet, the last packet takes up to
+        // 1396.
         assert_eq!(wire.bytes(6000), 5 * 84 + 6008);
         assert_eq!(wire.bytes(1400), 2 * 84 + 1408);
         assert_eq!(wire.bytes(1396), 1396 + 80);

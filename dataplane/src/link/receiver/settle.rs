@@ -55,12 +55,8 @@ impl ReceiveClass {
         }
         if !self.assemblies.is_empty() {
             let floor = self.message_floor;
-            let gone: Vec<u32> = self
-                .assemblies
-                .keys()
-                .copied()
-                .filter(|n| u64::from(*n) < floor)
-                .collect();
+            let gone: Vec<u32> =
+                self.assemblies.keys().copied().filter(|n| u64::from(*n) < floor).collect();
             for number in gone {
                 self.drop_assembly(inbox, number, DropReason::ReassemblyTimeout);
             }
@@ -119,8 +115,8 @@ impl ReceiveClass {
         }
     }
 
-    /// Nothing of a message came that a held one `waited` for. Its sender is told, and counts it: counted here it would be there
-    /// twice where its lifespan has ended on both sides.
+    /// Nothing of a message came that a held one `waited` for. Its sender is told, and counts it:
+    /// counted here it would be there twice where its lifespan has ended on both sides.
     fn note_given_up(&mut self, inbox: &mut Inbox<'_>, number: u32, waited: u32) {
         if self.given_up.len() < MAX_GIVEN_UP {
             self.given_up.insert(number);
@@ -129,7 +125,8 @@ impl ReceiveClass {
         }
     }
 
-    /// Hands out all complete messages in order and drops the unfinished ones: nothing more is expected.
+    /// Hands out all complete messages in order and drops the unfinished ones: nothing more is
+    /// expected.
     pub(crate) fn release_all(&mut self, inbox: &mut Inbox<'_>) {
         let unfinished: Vec<u32> = self.assemblies.keys().copied().collect();
         for number in unfinished {
@@ -141,7 +138,8 @@ impl ReceiveClass {
         }
     }
 
-    /// Frees memory: drops the oldest unfinished message, or stops waiting. Returns whether there was anything to free.
+    /// Frees memory: drops the oldest unfinished message, or stops waiting. Returns whether there
+    /// was anything to free.
     pub(crate) fn evict(&mut self, inbox: &mut Inbox<'_>) -> bool {
         let oldest = self.assemblies.iter().min_by_key(|(_, assembly)| assembly.first_part);
         if let Some(number) = oldest.map(|(number, _)| *number) {

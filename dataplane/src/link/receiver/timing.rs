@@ -7,24 +7,21 @@ use blaze_proto::link::link_control::Feedback;
 use prost::{Message as _, length_delimiter_len};
 
 use super::{
-    FEEDBACK_IDLE, GIVEN_UP_TOLD, Held, Inbox, LONGEST_PATIENCE, MISSING_RANGES, MORE_RANGES, PATIENCE, ReceiveClass,
-    SWEEP,
+    FEEDBACK_IDLE, GIVEN_UP_TOLD, Held, Inbox, LONGEST_PATIENCE, MISSING_RANGES, MORE_RANGES,
+    PATIENCE, ReceiveClass, SWEEP,
 };
 use crate::link::clock::nanoseconds;
 
-/// What the lists of a Feedback that fill its datagram take besides their numbers, at most: tags and lengths, that of the
-/// Feedback itself included, and `more_highest`.
+/// What the lists of a Feedback that fill its datagram take besides their numbers, at most: tags
+/// and lengths, that of the Feedback itself included, and `more_highest`.
 const FRAMING_BYTES: usize = 24;
 
 impl ReceiveClass {
     /// When something has to be done: report, or give up.
     pub(crate) fn next_timeout(&self, connected: bool) -> Option<Instant> {
         let idle = self.last_feedback.map(|last| last + FEEDBACK_IDLE);
-        let feedback = if self.feedback_due || !connected {
-            None
-        } else {
-            self.feedback_at.or(idle)
-        };
+        let feedback =
+            if self.feedback_due || !connected { None } else { self.feedback_at.or(idle) };
         [feedback, self.sweep_at, self.hand_out_at].into_iter().flatten().min()
     }
 
@@ -45,14 +42,14 @@ impl ReceiveClass {
     }
 
     fn is_overdue(&self, now: Instant, since: Instant, active: Duration) -> bool {
-        self.active.saturating_sub(active) >= PATIENCE || now.saturating_duration_since(since) >= LONGEST_PATIENCE
+        self.active.saturating_sub(active) >= PATIENCE
+            || now.saturating_duration_since(since) >= LONGEST_PATIENCE
     }
 
     /// Hands out the held messages that must not wait any longer.
     fn hand_out(&mut self, inbox: &mut Inbox<'_>, must: impl Fn(&Self, &Held) -> bool) {
-        let numbers = (self.held.iter())
-            .filter(|(_, held)| must(self, held))
-            .map(|(number, _)| *number);
+        let numbers =
+            (self.held.iter()).filter(|(_, held)| must(self, held)).map(|(number, _)| *number);
         for number in numbers.collect::<Vec<_>>() {
             self.give_up_before(inbox, number);
         }
@@ -82,9 +79,16 @@ impl ReceiveClass {
         self.feedback_due && self.link_epoch != 0
     }
 
-    /// What to report now. `share` is how much memory this peer may still take, `room` how many bytes the Feedback may take
-    /// as a `LinkControl`; those of its first ranges are taken in any case.
-    pub(crate) fn feedback(&mut self, now: Instant, class_code: u8, share: u64, room: usize) -> Feedback {
+    /// What to report now. `share` is how much memory this peer may still take, `room` how many
+    /// bytes the Feedback may take as a `LinkControl`; those of its first ranges are taken in any
+    /// case.
+    pub(crate) fn feedback(
+        &mut self,
+        now: Instant,
+        class_code: u8,
+        share: u64,
+        room: usize,
+    ) -> Feedback {
         self.feedback_due = false;
         self.feedback_at = None;
         self.samples = 0;
@@ -128,7 +132,8 @@ impl ReceiveClass {
             let bytes = length_delimiter_len((number - before) as usize);
             if bytes > room || feedback.given_up.len() >= GIVEN_UP_TOLD {
                 // Until it is told its sender must not take it for delivered.
-                feedback.delivered_message = feedback.delivered_message.min(number.saturating_sub(1));
+                feedback.delivered_message =
+                    feedback.delivered_message.min(number.saturating_sub(1));
                 break;
             }
             room -= bytes;
@@ -136,7 +141,9 @@ impl ReceiveClass {
             before = number;
         }
         while let Some(&(first, last)) = gaps.peek() {
-            let (Ok(came), Ok(count)) = (u32::try_from(first - end - 1), u32::try_from(last - first + 1)) else {
+            let (Ok(came), Ok(count)) =
+                (u32::try_from(first - end - 1), u32::try_from(last - first + 1))
+            else {
                 break;
             };
             let bytes = length_delimiter_len(came as usize) + length_delimiter_len(count as usize);

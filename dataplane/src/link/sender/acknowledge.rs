@@ -20,8 +20,7 @@ impl SendClass {
             self.window = view.window_bytes;
             self.missing.clear();
             for pair in view.missing.chunks_exact(2) {
-                self.missing
-                    .push((pair[0], pair[0].saturating_add(pair[1].saturating_sub(1))));
+                self.missing.push((pair[0], pair[0].saturating_add(pair[1].saturating_sub(1))));
             }
             self.settle(ctx, view.highest_sequence);
             self.rate.total(ctx.now, view.received_bytes);
@@ -34,7 +33,8 @@ impl SendClass {
         true
     }
 
-    /// Goes through the samples up to `highest`: those not missing are received; of those missing, some are lost.
+    /// Goes through the samples up to `highest`: those not missing are received; of those missing,
+    /// some are lost.
     pub(super) fn settle(&mut self, ctx: &mut SendContext<'_>, highest: u64) {
         let late = ctx.round_trip + ctx.round_trip / 8 + Duration::from_millis(2);
         let (mut received, mut lost) = (0, 0);
@@ -129,7 +129,8 @@ impl SendClass {
         }
     }
 
-    /// Drops what the receiver has given up without having seen any of it. It counts nothing of that.
+    /// Drops what the receiver has given up without having seen any of it. It counts nothing of
+    /// that.
     fn drop_given_up(&mut self, ctx: &mut SendContext<'_>, numbers: &[u32]) {
         for number in numbers {
             let Ok(at) = self.started.binary_search_by_key(number, |started| started.0) else {
@@ -148,7 +149,8 @@ impl SendClass {
         }
     }
 
-    /// Settles what the receiver is through with: delivered, or given up there before it was complete.
+    /// Settles what the receiver is through with: delivered, or given up there before it was
+    /// complete.
     fn settle_delivered(&mut self, ctx: &mut SendContext<'_>, delivered: u32) {
         if delivered >= self.next_number {
             return;
@@ -210,20 +212,13 @@ mod tests {
             ledger: &mut ledger,
             counters: &mut counters,
         };
-        let limits = SendLimits {
-            queue_bytes: 1 << 20,
-            streams: 8,
-            max_datagram: 60_000,
-        };
+        let limits = SendLimits { queue_bytes: 1 << 20, streams: 8, max_datagram: 60_000 };
         let mut class = SendClass::new(Priority::Bulk, 1, limits);
         let submit = Submit {
             to: &to,
             class: Priority::Bulk,
             lane: LaneId(1),
-            stream: StreamKey {
-                topic: 1,
-                writer: writer(1),
-            },
+            stream: StreamKey { topic: 1, writer: writer(1) },
             frame: frame(Post::large(1, 30_000), 1),
             arrived: now,
             reliable: true,

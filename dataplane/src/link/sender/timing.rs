@@ -34,9 +34,8 @@ impl SendClass {
     fn sweep(&mut self, ctx: &mut SendContext<'_>) {
         self.last_sweep = Some(ctx.now);
         // Of one that is wholly on the way it is not known whether it arrived in time.
-        let expired = self
-            .messages
-            .keys(|message| message.is_expired(ctx.now) && message.is_to_be_sent());
+        let expired =
+            self.messages.keys(|message| message.is_expired(ctx.now) && message.is_to_be_sent());
         for key in &expired {
             self.drop_message(*key, DropReason::Lifespan, ctx.ledger);
         }
@@ -67,7 +66,8 @@ impl SendClass {
         self.probe_due = false;
         self.last_probe = Some(ctx.now);
         let next_number = self.next_number;
-        // A probe repeats the number of the one before it if nothing came between, so that unanswered ones do not pile up.
+        // A probe repeats the number of the one before it if nothing came between, so that
+        // unanswered ones do not pile up.
         let unanswered = self.in_flight.back().is_some_and(|last| last.probe && !last.settled);
         let mut header = self.header(ctx, self.next_sequence(), next_number);
         let announces = self.announcement(&header);

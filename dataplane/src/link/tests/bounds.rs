@@ -15,10 +15,7 @@ use crate::testing::Random;
 
 #[test]
 fn the_oldest_that_waits_gives_way() {
-    let limits = Limits {
-        queue_bytes: [10_000; 3],
-        ..Limits::default()
-    };
+    let limits = Limits { queue_bytes: [10_000; 3], ..Limits::default() };
     let mut sim = Sim::with_limits(1, Weather::delay(10), &["edge/a", "fog/b"], limits);
     sim.run_ms(1_000);
     sim.nodes[0].rate = Some(1_000.0);
@@ -52,9 +49,7 @@ fn a_link_that_is_too_slow_carries_the_newest_pictures() {
         sim.publish(
             0,
             1,
-            Post::large(1, 100_000)
-                .lifespan(Some(Duration::from_millis(500)))
-                .newest(),
+            Post::large(1, 100_000).lifespan(Some(Duration::from_millis(500))).newest(),
         )
         .unwrap();
         assert!(
@@ -71,21 +66,14 @@ fn a_link_that_is_too_slow_carries_the_newest_pictures() {
         "a picture comes at any time: {arrived:?}"
     );
     let lane = &sim.nodes[0].lanes[&LaneId(1)];
-    assert_eq!(
-        lane.dropped.get(&DropReason::Lifespan),
-        None,
-        "none grows old in the queue"
-    );
+    assert_eq!(lane.dropped.get(&DropReason::Lifespan), None, "none grows old in the queue");
     assert_eq!(lane.dropped[&DropReason::QueueFull], 90 - arrived.len() as u64);
     sim.check_accounts();
 }
 
 #[test]
 fn a_started_message_is_finished_when_the_queue_overflows() {
-    let limits = Limits {
-        queue_bytes: [30_000; 3],
-        ..Limits::default()
-    };
+    let limits = Limits { queue_bytes: [30_000; 3], ..Limits::default() };
     let mut sim = Sim::with_limits(1, Weather::delay(10), &["edge/a", "fog/b"], limits);
     sim.run_ms(1_000);
     sim.nodes[0].rate = Some(100_000.0);
@@ -101,11 +89,7 @@ fn a_started_message_is_finished_when_the_queue_overflows() {
     let delivered = sim.sequences(1, 1);
     assert!(delivered.len() >= 12, "{delivered:?}");
     assert_eq!(delivered.last(), Some(&60), "the newest survives");
-    assert_eq!(
-        sim.nodes[1].engine.counters().reassembly_timeouts,
-        0,
-        "nothing was left half sent"
-    );
+    assert_eq!(sim.nodes[1].engine.counters().reassembly_timeouts, 0, "nothing was left half sent");
 }
 
 #[test]
@@ -121,11 +105,7 @@ fn a_lane_can_be_dropped() {
     }
     let dropped = sim.nodes[0].engine.drop_lane(LaneId(1));
     assert_eq!(dropped.messages, 5);
-    assert_eq!(
-        sim.nodes[0].engine.lane_queued(LaneId(1)).messages,
-        1,
-        "the started one goes on"
-    );
+    assert_eq!(sim.nodes[0].engine.lane_queued(LaneId(1)).messages, 1, "the started one goes on");
     sim.nodes[0].rate = None;
     sim.run_ms(1_000);
     assert_eq!(sim.sequences(1, 1), [1]);
@@ -155,23 +135,16 @@ struct Hostile {
     sequence: u64,
 }
 
-const SMALL: Limits = Limits {
-    queue_bytes: [100_000; 3],
-    reassembly_bytes: 1_000_000,
-    peers: 8,
-    streams: 64,
-};
+const SMALL: Limits =
+    Limits { queue_bytes: [100_000; 3], reassembly_bytes: 1_000_000, peers: 8, streams: 64 };
 
 impl Hostile {
     fn new(seed: u64) -> Self {
-        let mut sim = Sim::with_limits(seed, Weather::delay(5), &["edge/evil", "fog/b", "cloud/c"], SMALL);
+        let mut sim =
+            Sim::with_limits(seed, Weather::delay(5), &["edge/evil", "fog/b", "cloud/c"], SMALL);
         sim.run_ms(1_200);
         let endpoint = sim.endpoint(0);
-        Self {
-            sender: SenderId::of(&endpoint.flow, endpoint.epoch),
-            sim,
-            sequence: 0,
-        }
+        Self { sender: SenderId::of(&endpoint.flow, endpoint.epoch), sim, sequence: 0 }
     }
 
     fn header(&mut self, class: Priority) -> LinkHeader {
@@ -188,8 +161,8 @@ impl Hostile {
         }
     }
 
-    /// Sends a whole message in a sample of its own, after `lost` samples that never come. `settled`: of all samples before it
-    /// the sender knows what became of them.
+    /// Sends a whole message in a sample of its own, after `lost` samples that never come.
+    /// `settled`: of all samples before it the sender knows what became of them.
     fn post(&mut self, message: u32, behind: u16, frame: &Frame, lost: u64, settled: bool) {
         self.sequence += lost;
         let mut header = self.header(Priority::State);
@@ -210,16 +183,7 @@ impl Hostile {
 }
 
 fn part(message: u32, total: u32, offset: u32, length: u32, behind: u16) -> Record {
-    Record {
-        message,
-        total,
-        offset,
-        length,
-        hops: 1,
-        flags: 0,
-        behind,
-        age_us: 0,
-    }
+    Record { message, total, offset, length, hops: 1, flags: 0, behind, age_us: 0 }
 }
 
 #[test]
@@ -268,7 +232,8 @@ fn waiting_messages_of_a_hostile_peer_stay_within_bounds() {
 fn a_class_with_too_many_gaps_goes_on_once_its_sender_settles_them() {
     let mut hostile = Hostile::new(1);
     let frame = sim::frame(Post::small(1), 1);
-    // Every other sample is lost, and the sender knows of none what became of it. The last one says that all before are settled.
+    // Every other sample is lost, and the sender knows of none what became of it. The last one says
+    // that all before are settled.
     for message in 1..=9_001 {
         hostile.post(message, 0, &frame, 1, message > 9_000);
     }
@@ -327,14 +292,7 @@ fn random_and_mutated_datagrams_never_panic() {
     // Datagrams as they are sent in an ordinary exchange.
     let mut captured: Vec<(Priority, Bytes)> = Vec::new();
     let store = std::rc::Rc::new(std::cell::RefCell::new(Vec::new()));
-    let mut sim = Sim::new(
-        3,
-        Weather {
-            loss: 0.1,
-            ..Weather::delay(5)
-        },
-        &["edge/a", "fog/b"],
-    );
+    let mut sim = Sim::new(3, Weather { loss: 0.1, ..Weather::delay(5) }, &["edge/a", "fog/b"]);
     let into = std::rc::Rc::clone(&store);
     sim.network.censor = Some(Box::new(move |_, _, class, datagram| {
         into.borrow_mut().push((class, datagram.clone()));
@@ -354,7 +312,8 @@ fn random_and_mutated_datagrams_never_panic() {
         sim.run_ms(600);
         for _ in 0..300 {
             let at = usize::try_from(random.below(2)).unwrap();
-            let (class, datagram) = &captured[usize::try_from(random.below(captured.len() as u64)).unwrap()];
+            let (class, datagram) =
+                &captured[usize::try_from(random.below(captured.len() as u64)).unwrap()];
             let mut bytes = BytesMut::from(&datagram[..]);
             for _ in 0..random.below(4) {
                 let place = usize::try_from(random.below(bytes.len() as u64)).unwrap();
@@ -384,10 +343,7 @@ fn random_and_mutated_datagrams_never_panic() {
 
 #[test]
 fn who_finds_no_place_is_told_of_and_gets_one_when_it_is_free() {
-    let limits = Limits {
-        peers: 2,
-        ..Limits::default()
-    };
+    let limits = Limits { peers: 2, ..Limits::default() };
     let mut sim = Sim::with_limits(1, Weather::delay(5), &["edge/a", "fog/b", "cloud/c"], limits);
     sim.run_ms(1_000);
     let late = sim.join("edge/d");
@@ -416,10 +372,7 @@ fn who_finds_no_place_is_told_of_and_gets_one_when_it_is_free() {
 
 #[test]
 fn one_that_waits_for_a_place_and_goes_gets_none() {
-    let limits = Limits {
-        peers: 1,
-        ..Limits::default()
-    };
+    let limits = Limits { peers: 1, ..Limits::default() };
     let mut sim = Sim::with_limits(1, Weather::delay(5), &["edge/a", "fog/b"], limits);
     sim.run_ms(1_000);
     let late = sim.join("edge/d");

@@ -1,4 +1,5 @@
-//! What may go to each peer: limits of layers, the capacity that is measured, and what happens after an outage.
+//! What may go to each peer: limits of layers, the capacity that is measured, and what happens
+//! after an outage.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -89,10 +90,7 @@ fn cut(sim: &mut Sim) {
     assert_eq!(sim.nodes[0].engine.peer(&b).unwrap().state, PeerState::Suspect);
     sim.network.set_partition(&a, &b, false);
     sim.run_to(Duration::from_secs(2), "it acknowledges again", |sim| {
-        sim.nodes[0]
-            .engine
-            .peer(&b)
-            .is_some_and(|peer| peer.state == PeerState::Up)
+        sim.nodes[0].engine.peer(&b).is_some_and(|peer| peer.state == PeerState::Up)
     });
 }
 
@@ -116,10 +114,7 @@ fn after_an_outage_a_link_begins_low_and_with_what_is_small() {
         let (before, small) = (sent_to(&sim, 1), sim.sequences(1, 11).len());
         publish(&mut sim, &[1], 100_000, 250);
         let sent = sent_to(&sim, 1) - before;
-        assert!(
-            sent < 0.25 * 1.5 * expected + 10_000.0,
-            "{sent} bytes in a quarter of a second"
-        );
+        assert!(sent < 0.25 * 1.5 * expected + 10_000.0, "{sent} bytes in a quarter of a second");
         for _ in 0..10 {
             let before = sent_to(&sim, 1);
             publish(&mut sim, &[1], 100_000, 1_000);
@@ -134,26 +129,18 @@ fn after_an_outage_a_link_begins_low_and_with_what_is_small() {
     }
 }
 
-/// Cut for so long that the flow is forgotten: the estimate is gone, and the way may be another one.
+/// Cut for so long that the flow is forgotten: the estimate is gone, and the way may be another
+/// one.
 #[test]
 fn whoever_comes_back_after_it_was_forgotten_begins_low_as_well() {
     let mut sim = Sim::new(1, Weather::delay(25), &["edge/a", "fog/b"]);
     limit(&mut sim, &[], true);
     sim.run_ms(1_500);
     let (a, b) = (sim.id(0), sim.id(1));
-    assert_eq!(
-        capacity(&sim).state,
-        State::Unknown,
-        "at first nothing is known against it"
-    );
+    assert_eq!(capacity(&sim).state, State::Unknown, "at first nothing is known against it");
     sim.network.set_partition(&a, &b, true);
     sim.run_ms(70_000);
-    assert!(
-        sim.nodes[0]
-            .engine
-            .peer(&b)
-            .is_none_or(|peer| peer.state == PeerState::Down)
-    );
+    assert!(sim.nodes[0].engine.peer(&b).is_none_or(|peer| peer.state == PeerState::Down));
     sim.network.set_partition(&a, &b, false);
     for node in [0, 1] {
         sim.announce(node);
@@ -187,10 +174,7 @@ fn two_peers_of_one_layer_share_its_limit_and_hold_up_nobody_else() {
     assert!((0.95 * 10.0 * OF_FOG..=10.0 * OF_FOG).contains(&of_fog), "{sent:?}");
     assert!((sent[0] / of_fog - 0.5).abs() < 0.1, "they take turns: {sent:?}");
     let to_cloud = sim.sequences(3, 30).len() - published;
-    assert!(
-        (198..=202).contains(&to_cloud),
-        "{to_cloud} of 200 images in another layer"
-    );
+    assert!((198..=202).contains(&to_cloud), "{to_cloud} of 200 images in another layer");
     sim.check_deliveries();
     sim.check_accounts();
 }
@@ -211,18 +195,11 @@ fn whoever_waits_for_its_link_says_until_when() {
     assert_eq!(messages(engine, now), 3, "two were saved, and one more");
     let until = engine.paced_until().unwrap();
     // A datagram takes 14 ms.
-    assert!(
-        until > now && until < now + Duration::from_millis(20),
-        "{:?}",
-        until - now
-    );
+    assert!(until > now && until < now + Duration::from_millis(20), "{:?}", until - now);
     let before = until - Duration::from_millis(1);
     assert!(engine.poll_transmit(before).is_none());
     // LinkControl never waits, and is waited off.
-    let body = Body::SnapshotRequest(SnapshotRequest {
-        version: 3,
-        parts: vec![1],
-    });
+    let body = Body::SnapshotRequest(SnapshotRequest { version: 3, parts: vec![1] });
     engine.send_control(&b, body).unwrap();
     let control = engine.poll_transmit(before).unwrap();
     assert!(control.control && control.class == Priority::Control);

@@ -35,14 +35,8 @@ fn reliable_messages_arrive_all_in_order_and_once() {
         }
         sim.check_deliveries();
         sim.check_accounts();
-        assert!(
-            sim.nodes[0].lanes.values().all(|lane| lane.out == lane.submitted),
-            "seed {seed}"
-        );
-        assert!(
-            sim.nodes[0].lanes.values().all(|lane| lane.sent == lane.submitted),
-            "seed {seed}"
-        );
+        assert!(sim.nodes[0].lanes.values().all(|lane| lane.out == lane.submitted), "seed {seed}");
+        assert!(sim.nodes[0].lanes.values().all(|lane| lane.sent == lane.submitted), "seed {seed}");
         assert_eq!(sim.nodes[1].engine.reassembly_bytes(), 0);
     }
 }
@@ -51,10 +45,8 @@ fn reliable_messages_arrive_all_in_order_and_once() {
 fn best_effort_messages_arrive_in_order_and_once() {
     for seed in seeds() {
         let mut random = Random(seed);
-        let weather = Weather {
-            jitter: Duration::from_millis(3),
-            ..bad_weather(&mut random, 0.05)
-        };
+        let weather =
+            Weather { jitter: Duration::from_millis(3), ..bad_weather(&mut random, 0.05) };
         let mut sim = Sim::new(seed, weather, &["edge/a", "fog/b"]);
         sim.run_ms(1_000);
         for _ in 0..200 {
@@ -100,10 +92,7 @@ fn large_frames_are_repaired() {
         let repairs = sim.nodes[0].engine.counters().repairs;
         #[allow(clippy::cast_precision_loss, reason = "a few thousand")]
         let share = repairs as f64 / (5.0 * 809.0);
-        assert!(
-            share < loss * 2.0 + 0.01,
-            "seed {seed}: {share} repaired at {loss} loss"
-        );
+        assert!(share < loss * 2.0 + 0.01, "seed {seed}: {share} repaired at {loss} loss");
         let info = &sim.nodes[0].engine.peers()[0];
         assert!(
             (info.loss - loss).abs() < 0.02,
@@ -118,10 +107,7 @@ fn many_losses_in_one_round_trip_are_repaired_in_the_next() {
     let mut sim = Sim::new(1, Weather::delay(150), &["edge/a", "fog/b"]);
     sim.run_ms(2_000);
     let (a, b) = (sim.id(0), sim.id(1));
-    let weather = Weather {
-        loss: 0.2,
-        ..Weather::delay(150)
-    };
+    let weather = Weather { loss: 0.2, ..Weather::delay(150) };
     sim.network.set_path(&a, &b, weather);
     // Each in a sample of its own: about 70 gaps in the time from a loss to its repair.
     for _ in 0..6_000 {
@@ -181,18 +167,12 @@ fn an_outage_shorter_than_down_loses_nothing_reliable() {
         }
         sim.run_ms(5_000);
         let downs = sim.nodes.iter().flat_map(|node| &node.events);
-        let downs = downs
-            .filter(|event| matches!(event.1, LinkEvent::PeerDown { .. }))
-            .count();
+        let downs = downs.filter(|event| matches!(event.1, LinkEvent::PeerDown { .. })).count();
         assert_eq!(downs, 0, "seed {seed}");
         let mut events = sim.nodes[0].events.iter();
         let recovered = events.any(|(_, event)| matches!(event, LinkEvent::PeerRecovered { .. }));
         assert!(recovered, "seed {seed}: it was suspect meanwhile");
-        assert_eq!(
-            sim.sequences(1, 1),
-            (1..=100).collect::<Vec<_>>(),
-            "seed {seed}, {weather:?}"
-        );
+        assert_eq!(sim.sequences(1, 1), (1..=100).collect::<Vec<_>>(), "seed {seed}, {weather:?}");
         sim.check_deliveries();
         sim.check_accounts();
     }
@@ -212,7 +192,8 @@ fn lifespan_ends_at_both_ends() {
         "it arrived; that it was too late is counted there"
     );
     assert_eq!(sim.nodes[1].receiver_dropped.get(&DropReason::Lifespan), Some(&1));
-    // Too old while it waits: the first is on the way when the path is cut, the second waits for it to heal.
+    // Too old while it waits: the first is on the way when the path is cut, the second waits for it
+    // to heal.
     let (a, b) = (sim.id(0), sim.id(1));
     sim.network.set_partition(&a, &b, true);
     sim.publish(0, 1, span(200)).unwrap();
@@ -255,21 +236,15 @@ fn a_reliable_message_of_which_nothing_came_is_counted_once() {
         }
         assert_eq!(sim.sequences(1, 1), [1, 3], "{lifespan:?}");
         let lane = &sim.nodes[0].lanes[&LaneId(1)];
-        let reason = if lifespan.is_some() {
-            DropReason::Lifespan
-        } else {
-            DropReason::ReassemblyTimeout
-        };
+        let reason =
+            if lifespan.is_some() { DropReason::Lifespan } else { DropReason::ReassemblyTimeout };
         assert_eq!(lane.out, 2, "{lifespan:?}: what did not arrive is not out");
         assert_eq!(
             lane.dropped.iter().collect::<Vec<_>>(),
             [(&reason, &1)],
             "{lifespan:?}: counted by its sender"
         );
-        assert!(
-            sim.nodes[1].receiver_dropped.is_empty(),
-            "{lifespan:?}: and by nobody else"
-        );
+        assert!(sim.nodes[1].receiver_dropped.is_empty(), "{lifespan:?}: and by nobody else");
         sim.check_accounts();
     }
 }
@@ -308,10 +283,7 @@ fn age_counts_residence_half_the_round_trip_and_repair() {
     let true_age = delivered.at - sim.start - Duration::from_millis(2_000);
     let told = Duration::from_micros(delivered.frame.age_us());
     assert!(true_age > Duration::from_millis(130), "{true_age:?}");
-    assert!(
-        told.abs_diff(true_age) < Duration::from_millis(3),
-        "{told:?} told, {true_age:?} true"
-    );
+    assert!(told.abs_diff(true_age) < Duration::from_millis(3), "{told:?} told, {true_age:?} true");
 }
 
 #[test]
@@ -329,14 +301,7 @@ fn small_messages_share_a_datagram_and_none_waits() {
 
 #[test]
 fn used_up_message_numbers_begin_a_new_link_epoch() {
-    let mut sim = Sim::new(
-        1,
-        Weather {
-            loss: 0.05,
-            ..Weather::delay(10)
-        },
-        &["edge/a", "fog/b"],
-    );
+    let mut sim = Sim::new(1, Weather { loss: 0.05, ..Weather::delay(10) }, &["edge/a", "fog/b"]);
     sim.run_ms(1_200);
     sim.publish(0, 1, Post::reliable(1)).unwrap();
     sim.run_ms(500);

@@ -16,7 +16,9 @@ fn names(sim: &Sim, at: usize) -> Vec<String> {
         LinkEvent::PeerUp(Endpoint { flow, epoch }) => Some(format!("up {flow} {epoch}")),
         LinkEvent::PeerSuspect { flow } => Some(format!("suspect {flow}")),
         LinkEvent::PeerRecovered { flow } => Some(format!("recovered {flow}")),
-        LinkEvent::PeerDown { endpoint, reason } => Some(format!("down {} {reason:?}", endpoint.flow)),
+        LinkEvent::PeerDown { endpoint, reason } => {
+            Some(format!("down {} {reason:?}", endpoint.flow))
+        }
         LinkEvent::PeerForgotten(peer) => Some(format!("forgotten {}", peer.flow)),
         _ => None,
     });
@@ -40,18 +42,19 @@ fn peers_are_up_after_a_round_trip_and_know_their_clocks() {
     let info = sim.nodes[0].engine.peers().remove(0);
     assert_eq!(info.state, PeerState::Up);
     assert_eq!((info.version, info.digest), (9, 77));
-    let told = |event: &LinkEvent| matches!(event, LinkEvent::Hello { hello, .. } if hello.state() == State::Ready);
+    let told = |event: &LinkEvent| {
+        matches!(
+            event,
+            LinkEvent::Hello { hello, .. } if hello.state() == State::Ready,
+        )
+    };
     assert!(sim.nodes[0].events.iter().any(|(_, event)| told(event)));
     assert_eq!(info.rtt, Some(Duration::from_millis(80)));
-    assert!(
-        (info.clock_offset_ns.unwrap() - 5_000_000_000).abs() < 1_000_000,
-        "{info:?}"
-    );
+    assert!((info.clock_offset_ns.unwrap() - 5_000_000_000).abs() < 1_000_000, "{info:?}");
     assert_eq!(info.clock_error, Some(Duration::from_millis(40)));
-    let told = sim.nodes[0]
-        .events
-        .iter()
-        .any(|(_, event)| matches!(event, LinkEvent::Addresses(addresses) if addresses == &["10.0.0.2"]));
+    let told = sim.nodes[0].events.iter().any(
+        |(_, event)| matches!(event, LinkEvent::Addresses(addresses) if addresses == &["10.0.0.2"]),
+    );
     assert!(told);
 }
 
@@ -89,20 +92,16 @@ fn silence_is_suspect_then_down_then_forgotten() {
     sim.run_to(Duration::from_secs(1), "down", |sim| {
         sim.nodes[0].engine.peers()[0].state == PeerState::Down
     });
-    assert!(sim.now - cut_at >= Duration::from_millis(2_000) && sim.now - cut_at <= Duration::from_millis(2_600));
+    assert!(
+        sim.now - cut_at >= Duration::from_millis(2_000)
+            && sim.now - cut_at <= Duration::from_millis(2_600)
+    );
     assert_eq!(
-        sim.nodes[0]
-            .lanes
-            .values()
-            .map(|lane| lane.dropped[&DropReason::LinkDown])
-            .sum::<u64>(),
+        sim.nodes[0].lanes.values().map(|lane| lane.dropped[&DropReason::LinkDown]).sum::<u64>(),
         2
     );
     assert_eq!(sim.publish(0, 1, Post::small(2)), Err(DropReason::LinkDown));
-    assert_eq!(
-        sim.nodes[0].engine.send_control(&b, request()),
-        Err(DropReason::LinkDown)
-    );
+    assert_eq!(sim.nodes[0].engine.send_control(&b, request()), Err(DropReason::LinkDown));
     sim.run_ms(57_000);
     assert_eq!(sim.nodes[0].engine.peers().len(), 1);
     sim.run_ms(3_000);
@@ -114,10 +113,7 @@ fn silence_is_suspect_then_down_then_forgotten() {
 }
 
 fn request() -> Body {
-    Body::SnapshotRequest(SnapshotRequest {
-        version: 3,
-        parts: vec![1],
-    })
+    Body::SnapshotRequest(SnapshotRequest { version: 3, parts: vec![1] })
 }
 
 #[test]
@@ -144,10 +140,7 @@ fn a_peer_that_returns_starts_anew_and_gets_nothing_old() {
         sim.run_ms(3_000);
         assert_eq!(sim.sequences(1, 1), [1, 7, 8, 9, 10, 11], "seed {seed}, {weather:?}");
         sim.check_accounts();
-        assert_eq!(
-            sim.nodes[0].lanes[&super::super::LaneId(1)].dropped[&DropReason::LinkDown],
-            5
-        );
+        assert_eq!(sim.nodes[0].lanes[&super::super::LaneId(1)].dropped[&DropReason::LinkDown], 5);
     }
 }
 
@@ -204,10 +197,7 @@ fn a_new_life_replaces_the_old_one_and_an_older_one_is_ignored() {
 #[test]
 fn one_that_never_answers_is_forgotten() {
     let mut sim = Sim::new(1, Weather::delay(10), &["edge/a"]);
-    let ghost = |name: &str| Endpoint {
-        flow: name.parse().unwrap(),
-        epoch: 4,
-    };
+    let ghost = |name: &str| Endpoint { flow: name.parse().unwrap(), epoch: 4 };
     sim.nodes[0].engine.peer_discovered(sim.now, ghost("fog/b"));
     sim.nodes[0].engine.peer_discovered(sim.now, ghost("fog/c"));
     sim.nodes[0].engine.peer_discovered(sim.now, ghost("edge/a"));
@@ -263,24 +253,20 @@ fn registry_messages_pass_and_are_bounded() {
     let to = sim.id(1);
     sim.nodes[0].engine.send_control(&to, request()).unwrap();
     sim.run_ms(50);
-    let got = sim.nodes[1]
-        .events
-        .iter()
-        .filter(|(_, event)| matches!(event, LinkEvent::Control { .. }));
+    let got =
+        sim.nodes[1].events.iter().filter(|(_, event)| matches!(event, LinkEvent::Control { .. }));
     assert_eq!(got.count(), 1);
     let mut refused = None;
     for _ in 0..1_000 {
         refused = sim.nodes[0].engine.send_control(&to, request()).err().or(refused);
     }
     assert_eq!(refused, Some(DropReason::QueueFull));
-    let huge = Body::SnapshotRequest(SnapshotRequest {
-        version: 1,
-        parts: vec![u32::MAX; 300],
-    });
+    let huge = Body::SnapshotRequest(SnapshotRequest { version: 1, parts: vec![u32::MAX; 300] });
     assert_eq!(sim.nodes[0].engine.send_control(&to, huge), Err(DropReason::TooLarge));
 }
 
-/// Everything at once: loss, cuts of one or both directions, crashes, rebuilt participants, all kinds of messages.
+/// Everything at once: loss, cuts of one or both directions, crashes, rebuilt participants, all
+/// kinds of messages.
 #[test]
 fn whatever_happens_accounts_balance_and_nothing_comes_twice() {
     for seed in seeds() {
@@ -312,8 +298,8 @@ fn whatever_happens_accounts_balance_and_nothing_comes_twice() {
                 15..18 => sim.run(random.duration(Duration::from_secs(4))),
                 _ => {
                     // One stream per pair, so that one flow's writer is never heard through two.
-                    let stream =
-                        u32::try_from(from * 1000 + to * 100).unwrap() + u32::try_from(random.below(3)).unwrap();
+                    let stream = u32::try_from(from * 1000 + to * 100).unwrap()
+                        + u32::try_from(random.below(3)).unwrap();
                     let post = Post {
                         class: blaze_domain::Priority::ALL[stream as usize % 3],
                         stream,
@@ -344,12 +330,7 @@ fn whatever_happens_accounts_balance_and_nothing_comes_twice() {
         sim.check_accounts();
         sim.check_deliveries();
         for node in &sim.nodes {
-            let up = node
-                .engine
-                .peers()
-                .iter()
-                .filter(|peer| peer.state == PeerState::Up)
-                .count();
+            let up = node.engine.peers().iter().filter(|peer| peer.state == PeerState::Up).count();
             assert_eq!(up, 3, "seed {seed}: all are up again");
             let queued: usize = node.engine.peers().iter().flat_map(|peer| peer.queue_bytes).sum();
             assert_eq!(queued, 0, "seed {seed}: everything is out or dropped");
@@ -366,21 +347,12 @@ fn an_uneven_path_keeps_the_clock_within_its_error() {
     sim.network.set_path(
         &b,
         &a,
-        Weather {
-            jitter: Duration::from_millis(30),
-            ..Weather::delay(5)
-        },
+        Weather { jitter: Duration::from_millis(30), ..Weather::delay(5) },
     );
     sim.run_ms(6_000);
     let info = sim.nodes[0].engine.peer(&b).unwrap();
     let (offset, error) = (info.clock_offset_ns.unwrap(), info.clock_error.unwrap());
-    assert!(
-        error < Duration::from_millis(45),
-        "the best of eight exchanges: {error:?}"
-    );
-    assert!(
-        u128::from(offset.unsigned_abs()) <= error.as_nanos(),
-        "{offset} ns, {error:?}"
-    );
+    assert!(error < Duration::from_millis(45), "the best of eight exchanges: {error:?}");
+    assert!(u128::from(offset.unsigned_abs()) <= error.as_nanos(), "{offset} ns, {error:?}");
     assert!(info.rtt.unwrap() > Duration::from_millis(75));
 }

@@ -1,5 +1,5 @@
-//! Properties of the link over a simulated network. Each runs with 200 seeds, or with as many as the environment variable
-//! `BLAZE_LINK_SEEDS` says.
+//! Properties of the link over a simulated network. Each runs with 200 seeds, or with as many as
+//! the environment variable `BLAZE_LINK_SEEDS` says.
 
 mod bounds;
 mod budgets;

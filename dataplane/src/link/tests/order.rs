@@ -9,7 +9,8 @@ use super::super::wire::{HEADER_BYTES, RECORD_BYTES};
 use super::seeds;
 use crate::testing::Random;
 
-/// Loses the first datagram of user messages from `edge`, of that class, with at least so many bytes.
+/// Loses the first datagram of user messages from `edge`, of that class, with at least so many
+/// bytes.
 fn lose_first(sim: &mut Sim, wanted: Priority, at_least: usize) {
     let mut lost = false;
     sim.network.censor = Some(Box::new(move |from, _, class, datagram| {

@@ -17,10 +17,7 @@ fn denied(plan: &TopicPlan) -> Vec<String> {
         Destination::Flow(flow) => flow.to_string(),
         Destination::Layer(layer) => layer.to_string(),
     };
-    let denied = plan
-        .blocked
-        .iter()
-        .filter(|blocked| blocked.code == WhyCode::AccessDenied);
+    let denied = plan.blocked.iter().filter(|blocked| blocked.code == WhyCode::AccessDenied);
     denied.map(|blocked| to(&blocked.to)).collect()
 }
 
@@ -32,7 +29,8 @@ fn advertise_rule(deny: &[&str]) -> Value {
     json!({"advertise": {"deny": deny}})
 }
 
-/// Rows: the rule of the first flow | the flows | bridges of the first | whom the rule leaves without the topic | name.
+/// Rows: the rule of the first flow | the flows | bridges of the first | whom the rule leaves
+/// without the topic | name.
 fn check(text: &str) {
     for [rule, lines, expected, left, name] in rows(text) {
         let words: Vec<&str> = rule.split(' ').collect();
@@ -66,7 +64,8 @@ fn requesters_of_other_flows_that_the_rules_refuse_are_not_served() {
     );
 }
 
-/// Others choose who receives without knowing the rules, so a refused requester still counts among those who could.
+/// Others choose who receives without knowing the rules, so a refused requester still counts among
+/// those who could.
 #[test]
 fn a_refused_node_of_the_layer_may_be_the_one_that_receives() {
     let mut world = world(&["e/a@1 node-", "e/b@1 node-", "c/x node+"]);
@@ -84,18 +83,11 @@ fn a_refused_node_of_the_layer_may_be_the_one_that_receives() {
 /// A flow that is not on the inter scope hears that somebody outside asks, not who.
 #[test]
 fn to_a_member_the_origin_of_requests_from_outside_is_unknown() {
-    for (rule, served) in [
-        (request_rule(&["c"]), true),
-        (json!({"request": {"allow": ["e", "c"]}}), false),
-    ] {
+    for (rule, served) in
+        [(request_rule(&["c"]), true), (json!({"request": {"allow": ["e", "c"]}}), false)]
+    {
         let mut world = world(&["e/a@1 member node+", "e/g@1"]);
-        let told = world
-            .flows
-            .get_mut(&id("e/g"))
-            .unwrap()
-            .topics
-            .entry(topic())
-            .or_default();
+        let told = world.flows.get_mut(&id("e/g")).unwrap().topics.entry(topic()).or_default();
         told.outside.request = Some(request());
         world.access = rules(rule);
         let plan = plan(&world);
@@ -121,10 +113,7 @@ fn who_is_reached_by_none_but_refused_publishers_is_told() {
 
 #[test]
 fn of_publishers_that_are_not_all_named_nobody_says_that_they_are_refused() {
-    let source = |service: &str| Source {
-        node: String::new(),
-        service: service.to_owned(),
-    };
+    let source = |service: &str| Source { node: String::new(), service: service.to_owned() };
     let mut world = world(&["f/a node-", "c/x node+"]);
     world.access = rules(advertise_rule(&["c/x/driver", "c/x/filter"]));
     assert_eq!(denied(&plan(&world)), ["f/a"]);

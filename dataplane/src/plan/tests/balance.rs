@@ -1,4 +1,5 @@
-//! Moves by load: they end, they never make the largest load larger, and what they leave cannot be made better.
+//! Moves by load: they end, they never make the largest load larger, and what they leave cannot be
+//! made better.
 
 use std::collections::BTreeMap;
 
@@ -92,7 +93,11 @@ proptest! {
             prop_assert!(after[from].max(after[to]) < before[from], "{before:?} {after:?}");
             prop_assert!(after.iter().max() <= before.iter().max());
             prop_assert!(squares(&after) < squares(&before), "it could come back to where it was");
-            prop_assert!(moves <= 4 * group.topics.len(), "{moves} moves of {} topics", group.topics.len());
+            prop_assert!(
+                moves <= 4 * group.topics.len(),
+                "{moves} moves of {} topics",
+                group.topics.len(),
+            );
         }
         // Whoever still carries too much has nothing whose move to the least loaded would help.
         let loads = group.loads();
@@ -102,13 +107,16 @@ proptest! {
             let gap = load - least;
             if *load as f64 > 1.25 * mean && gap > MIN_GAP {
                 let mut mine = group.topics.values().filter(|(at, _)| *at == flow);
-                let helps = |(_, weight): &(usize, u64)| (*weight).min(gap.saturating_sub(*weight)) >= MIN_GAP / 4;
+                let helps =
+                    |(_, weight): &(usize, u64)| (*weight)
+                    .min(gap.saturating_sub(*weight)) >= MIN_GAP / 4;
                 prop_assert!(!mine.any(helps), "{loads:?}");
             }
         }
     }
 
-    /// Measured loads differ from true ones by a few per cent, each time anew: once it is even it stays as it is.
+    /// Measured loads differ from true ones by a few per cent, each time anew: once it is even it
+    /// stays as it is.
     #[test]
     fn noise_moves_nothing_to_and_fro(
         count in 2..5_usize,
@@ -154,31 +162,23 @@ fn absurd_loads_do_no_harm() {
     assert!(group.proposal(0).is_some());
     let flows = ["cloud/a", "cloud/b", "cloud/c"].map(id);
     let members: Vec<Member<'_>> = (flows.iter().zip([u64::MAX, u64::MAX, 0]))
-        .map(|(flow, bytes_per_s)| Member {
-            flow,
-            bytes_per_s,
-            rests: false,
-        })
+        .map(|(flow, bytes_per_s)| Member { flow, bytes_per_s, rests: false })
         .collect();
     assert_eq!(next_move(&flows[0], &members, &[]), None);
 }
 
 #[test]
 fn whoever_carries_most_has_the_first_word_and_one_that_rests_is_left_alone() {
-    let topics: Vec<(usize, u64)> = [(0, 5), (0, 4), (1, 4), (1, 4)]
-        .map(|(at, load)| (at, load * 100 * KIB))
-        .to_vec();
+    let topics: Vec<(usize, u64)> =
+        [(0, 5), (0, 4), (1, 4), (1, 4)].map(|(at, load)| (at, load * 100 * KIB)).to_vec();
     let mut group = Group::new(vec![0, 0, 0, 0], &topics);
-    let ranks = |group: &Group| [0, 1].map(|flow| group.proposal(flow).map(|proposal| proposal.rank));
+    let ranks =
+        |group: &Group| [0, 1].map(|flow| group.proposal(flow).map(|proposal| proposal.rank));
     assert_eq!(ranks(&group), [Some(0), Some(1)]);
     group.resting[0] = true;
     assert_eq!(ranks(&group), [None, Some(0)]);
     (group.resting[0], group.resting[2]) = (false, true);
     assert_eq!(group.proposal(0).unwrap().to, id("cloud/c3"));
     group.resting[3] = true;
-    assert_eq!(
-        ranks(&group),
-        [None, None],
-        "nobody to give to but one that carries as much"
-    );
+    assert_eq!(ranks(&group), [None, None], "nobody to give to but one that carries as much");
 }

@@ -11,7 +11,8 @@ use crate::plan::told::{told_inside, told_outside};
 use super::worlds::{advertise, flow, request, topic};
 use crate::testing::Random;
 use crate::world::{
-    Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, Role, ScopeEntry, Source, TopicEntry, World,
+    Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, Role, ScopeEntry, Source,
+    TopicEntry, World,
 };
 
 const SERVICES: [&str; 3] = ["driver", "filter", "logger"];
@@ -30,7 +31,8 @@ impl System {
         let mut flows = BTreeMap::new();
         for l in 0..3 + dice.index(4) {
             let kind = *dice.pick(LayerKind::ALL);
-            // Brokers of different layers may have one number; in one layer there may be two, or flows without.
+            // Brokers of different layers may have one number; in one layer there may be two, or
+            // flows without.
             let brokers: &[Option<u64>] = match dice.index(4) {
                 0 => &[None],
                 1 => &[Some(1)],
@@ -50,11 +52,7 @@ impl System {
             .chain(["ghost".to_owned()])
             .collect();
         let me = flows.keys().next().unwrap().clone();
-        let world = World {
-            me,
-            flows,
-            access: AccessRules::default(),
-        };
+        let world = World { me, flows, access: AccessRules::default() };
         let mut system = Self { world, nodes };
         for id in system.ids() {
             system.reroll_flow(dice, &id);
@@ -64,8 +62,9 @@ impl System {
         system
     }
 
-    /// One with a group of more than 16 flows, where some flows of each group are not on the inter scope. Types and
-    /// sources that are not named are left out: where a gateway tells of several scopes as of one, they match more than they do.
+    /// One with a group of more than 16 flows, where some flows of each group are not on the inter
+    /// scope. Types and sources that are not named are left out: where a gateway tells of several
+    /// scopes as of one, they match more than they do.
     pub(crate) fn with_gateways(dice: &mut Random) -> Self {
         let mut system = Self::random(dice);
         for n in 0..17 + dice.index(6) {
@@ -81,19 +80,11 @@ impl System {
                 }
             }
         }
-        let first = system
-            .ids()
-            .into_iter()
-            .find(|id| id.layer.as_str() == "layer-9")
-            .unwrap();
+        let first = system.ids().into_iter().find(|id| id.layer.as_str() == "layer-9").unwrap();
         system.reroll_layer(dice, &first);
         for view in system.world.flows.values_mut() {
             let shares = view.layer_scope.is_some();
-            view.role = if shares && dice.percent(70) {
-                Role::Member
-            } else {
-                Role::Gateway
-            };
+            view.role = if shares && dice.percent(70) { Role::Member } else { Role::Gateway };
         }
         system.tell_precisely();
         system
@@ -110,27 +101,25 @@ impl System {
         }
     }
 
-    /// What a flow knows: of its group everything, of others what their gateways tell, if it is on the inter scope, or else
-    /// what a gateway of its own tells.
+    /// What a flow knows: of its group everything, of others what their gateways tell, if it is on
+    /// the inter scope, or else what a gateway of its own tells.
     pub(crate) fn known_to(&self, me: &FlowId) -> World {
-        let all = |me: &FlowId| World {
-            me: me.clone(),
-            ..self.world.clone()
-        };
+        let all = |me: &FlowId| World { me: me.clone(), ..self.world.clone() };
         let own = &self.world.flows[me];
         if self.world.flows.values().all(|view| view.role.is_inside()) {
             return all(me);
         }
-        let group = |id: &FlowId| share_broker((me, own.layer_scope), (id, self.world.flows[id].layer_scope));
+        let group = |id: &FlowId| {
+            share_broker((me, own.layer_scope), (id, self.world.flows[id].layer_scope))
+        };
         let mut known = all(me);
-        known
-            .flows
-            .retain(|id, view| group(id) || (own.role.is_inside() && view.role.is_inside()));
+        known.flows.retain(|id, view| group(id) || (own.role.is_inside() && view.role.is_inside()));
         for (id, view) in &mut known.flows {
             if !group(id) {
                 view.topics.clear();
-                view.topics
-                    .extend(told_outside(&Survey::new(&all(id)), &topic()).map(|told| (topic(), told)));
+                view.topics.extend(
+                    told_outside(&Survey::new(&all(id)), &topic()).map(|told| (topic(), told)),
+                );
             } else if id != me && view.role.is_gateway() && !own.role.is_gateway() {
                 let outside = told_inside(&Survey::new(&self.known_to(id)), &topic());
                 view.topics.entry(topic()).or_default().outside = outside;
@@ -178,7 +167,9 @@ impl System {
         let entry = self.scope_entry(dice, None);
         let broker = self.world.flows[id].layer_scope;
         for other in self.ids() {
-            let same = broker.is_some() && other.layer == id.layer && self.world.flows[&other].layer_scope == broker;
+            let same = broker.is_some()
+                && other.layer == id.layer
+                && self.world.flows[&other].layer_scope == broker;
             if same || other == *id {
                 self.entry(&other).layer = entry.clone();
             }
@@ -228,16 +219,11 @@ impl System {
             })
             .collect();
         let wish = dice.index(4);
-        Request {
-            from,
-            type_name: type_name(dice),
-            framed: wish < 3,
-            bare: wish > 1,
-            ..request()
-        }
+        Request { from, type_name: type_name(dice), framed: wish < 3, bare: wish > 1, ..request() }
     }
 
-    /// Who really publishes behind an advertisement: what it lists, and everybody that it may have left out.
+    /// Who really publishes behind an advertisement: what it lists, and everybody that it may have
+    /// left out.
     pub(crate) fn sources(&self, advertise: &Advertise, node: Option<&str>) -> Vec<Source> {
         let mut sources = advertise.sources.clone();
         if advertise.more_sources {
@@ -246,10 +232,12 @@ impl System {
                 None => self.nodes.iter().map(String::as_str).chain([""]).collect(),
             };
             for node in nodes {
-                sources.extend(SERVICES.map(|service| Source {
-                    node: node.to_owned(),
-                    service: service.to_owned(),
-                }));
+                sources.extend(
+                    SERVICES.map(|service| Source {
+                        node: node.to_owned(),
+                        service: service.to_owned(),
+                    }),
+                );
             }
             sources.sort();
             sources.dedup();
@@ -263,6 +251,9 @@ fn type_name(dice: &mut Random) -> String {
 }
 
 /// Whether two flows use one layer broker.
-pub(crate) fn share_broker(a: (&FlowId, Option<LayerScopeId>), b: (&FlowId, Option<LayerScopeId>)) -> bool {
+pub(crate) fn share_broker(
+    a: (&FlowId, Option<LayerScopeId>),
+    b: (&FlowId, Option<LayerScopeId>),
+) -> bool {
     a.0 == b.0 || (a.0.layer == b.0.layer && a.1.is_some() && a.1 == b.1)
 }

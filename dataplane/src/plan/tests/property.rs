@@ -1,5 +1,5 @@
-//! What must hold in every system: each requester gets each matching message once, over one path, and nothing is made
-//! that carries nothing.
+//! What must hold in every system: each requester gets each matching message once, over one path,
+//! and nothing is made that carries nothing.
 
 use std::collections::BTreeMap;
 
@@ -16,11 +16,7 @@ type Plans = BTreeMap<FlowId, TopicPlan>;
 /// 2,000 worlds, or 10,000 with `BLAZE_LONG=1`.
 #[allow(clippy::disallowed_methods, reason = "a test has no configuration loader")]
 fn worlds() -> u64 {
-    if std::env::var("BLAZE_LONG").is_ok_and(|long| long == "1") {
-        10_000
-    } else {
-        2_000
-    }
+    if std::env::var("BLAZE_LONG").is_ok_and(|long| long == "1") { 10_000 } else { 2_000 }
 }
 
 /// Plans of all flows that live, in the view that all share. A plan of many topics is the same.
@@ -54,10 +50,7 @@ fn each_message_reaches_each_requester_once_over_one_path() {
     }
     // The worlds are not empty ones.
     let worlds = usize::try_from(worlds()).unwrap();
-    assert!(
-        carried > 10 * worlds && bridges > 5 * worlds,
-        "{carried} messages, {bridges} bridges"
-    );
+    assert!(carried > 10 * worlds && bridges > 5 * worlds, "{carried} messages, {bridges} bridges");
     println!("{worlds} worlds, {bridges} bridges, {carried} messages carried");
 }
 
@@ -72,11 +65,8 @@ fn behind_gateways_each_message_reaches_each_requester_once_over_one_path() {
         let mut past = Plans::new();
         for step in 0..3 {
             let plans = plans(&system, &past);
-            let intakes: &[Intake] = if step == 0 {
-                &[Intake::Bridges, Intake::Delivery]
-            } else {
-                &[Intake::Delivery]
-            };
+            let intakes: &[Intake] =
+                if step == 0 { &[Intake::Bridges, Intake::Delivery] } else { &[Intake::Delivery] };
             for intake in intakes {
                 let mut simulation = Simulation::new(&system, &plans, *intake);
                 if let Err(fault) = simulation.run() {
@@ -98,7 +88,10 @@ fn behind_gateways_each_message_reaches_each_requester_once_over_one_path() {
         carried > 10 * worlds && over_gateways > worlds,
         "{carried} messages, {over_gateways} relayed"
     );
-    println!("{worlds} worlds, {carried} messages carried, {over_gateways} over a gateway for another flow");
+    println!(
+        "{worlds} worlds, {carried} messages carried, {over_gateways} over a gateway for another \
+         flow"
+    );
 }
 
 #[test]
@@ -125,11 +118,7 @@ fn nothing_moves_without_a_reason() {
         let mut dice = Random(seed ^ 0xBEEF);
         let mut system = System::random(&mut dice);
         let past = plans(&system, &Plans::new());
-        assert_eq!(
-            past,
-            plans(&system, &past),
-            "seed {seed}: the same world, the same plan"
-        );
+        assert_eq!(past, plans(&system, &past), "seed {seed}: the same world, the same plan");
         system.change(&mut dice);
         let fresh = plans(&system, &Plans::new());
         for (flow, plan) in plans(&system, &past) {
@@ -139,9 +128,7 @@ fn nothing_moves_without_a_reason() {
                     continue;
                 };
                 let wanted = |plan: &TopicPlan| {
-                    plan.bridges
-                        .iter()
-                        .any(|b| (b.from, &b.to) == (bridge.from, &bridge.to))
+                    plan.bridges.iter().any(|b| (b.from, &b.to) == (bridge.from, &bridge.to))
                 };
                 // Where a fresh plan would choose it, or it is still a candidate, it is kept.
                 assert!(
@@ -152,10 +139,7 @@ fn nothing_moves_without_a_reason() {
             }
         }
     }
-    assert!(
-        kept > 0,
-        "no world where a receiver stayed though a fresh plan would move it"
-    );
+    assert!(kept > 0, "no world where a receiver stayed though a fresh plan would move it");
 }
 
 #[test]
@@ -165,9 +149,11 @@ fn equal_worlds_give_equal_plans_in_one_order() {
         let first = plans(&system, &Plans::new());
         assert_eq!(first, plans(&System::random(&mut Random(seed)), &Plans::new()));
         for plan in first.values() {
-            let keys: Vec<_> = plan.bridges.iter().map(|bridge| (bridge.from, &bridge.to)).collect();
+            let keys: Vec<_> =
+                plan.bridges.iter().map(|bridge| (bridge.from, &bridge.to)).collect();
             assert!(keys.is_sorted() && keys.windows(2).all(|pair| pair[0] != pair[1]));
-            let blocked: Vec<_> = plan.blocked.iter().map(|blocked| (&blocked.to, blocked.code)).collect();
+            let blocked: Vec<_> =
+                plan.blocked.iter().map(|blocked| (&blocked.to, blocked.code)).collect();
             assert!(blocked.is_sorted() && blocked.windows(2).all(|pair| pair[0] != pair[1]));
         }
     }
@@ -213,7 +199,8 @@ fn a_topic_of_a_thousand_flows_is_planned_soon() {
     };
     let (took, plan) = (0..3).map(|_| timed()).min_by_key(|(took, _)| *took).unwrap();
     println!("{} bridges in {took:?}", plan.bridges.len());
-    // Its own layer, 99 others at the edge, the fog, and what comes in: to the layer, or by it, to the node.
+    // Its own layer, 99 others at the edge, the fog, and what comes in: to the layer, or by it, to
+    // the node.
     assert!((102..106).contains(&plan.bridges.len()), "{}", plan.bridges.len());
     assert!(took.as_millis() < 1000, "{took:?}");
 }

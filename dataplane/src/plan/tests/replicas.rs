@@ -1,5 +1,5 @@
-//! Who of the flows that share a layer broker carries a topic out of the layer, and who takes in what others send: when one
-//! joins, leaves, dies, or two think that it is theirs.
+//! Who of the flows that share a layer broker carries a topic out of the layer, and who takes in
+//! what others send: when one joins, leaves, dies, or two think that it is theirs.
 
 use std::collections::BTreeSet;
 
@@ -41,10 +41,7 @@ fn set(world: &mut World, flow: &FlowId, carrying: Carrying) {
 }
 
 fn plan_of(world: &World, flow: &FlowId, previous: Option<&TopicPlan>) -> TopicPlan {
-    let seen = World {
-        me: flow.clone(),
-        ..world.clone()
-    };
+    let seen = World { me: flow.clone(), ..world.clone() };
     plan_topic(&seen, &topic(), &PlanRules::default(), previous)
 }
 
@@ -121,15 +118,8 @@ fn a_topic_is_given_to_whom_its_handover_names_and_else_to_whom_hashing_chooses(
     assert_eq!(plan_of(&world, &second, None).carrier, Some(third.clone()));
     let mut gone = world.clone();
     view(&mut gone, &third).reach = Reach::Down;
-    assert_eq!(
-        carriers(&gone),
-        std::slice::from_ref(&second),
-        "it keeps what it cannot give"
-    );
-    let handover = Handover {
-        to: Some(third.clone()),
-        ..[7].into()
-    };
+    assert_eq!(carriers(&gone), std::slice::from_ref(&second), "it keeps what it cannot give");
+    let handover = Handover { to: Some(third.clone()), ..[7].into() };
     set(&mut world, &second, Carrying::HandedOver(handover));
     assert_eq!(carriers(&world), std::slice::from_ref(&third));
     for flow in [&best, &second] {
@@ -170,11 +160,7 @@ fn a_flow_that_goes_is_waited_for_until_it_has_said_where_it_stopped() {
     );
     let mut gone = world.clone();
     view(&mut gone, &best).reach = Reach::Down;
-    assert_eq!(
-        carriers(&gone),
-        std::slice::from_ref(&second),
-        "it died before it said so"
-    );
+    assert_eq!(carriers(&gone), std::slice::from_ref(&second), "it died before it said so");
     gone.flows.remove(&best);
     assert_eq!(carriers(&gone), std::slice::from_ref(&second), "it said good-bye");
     set(&mut world, &best, Carrying::HandedOver([7].into()));
@@ -189,10 +175,7 @@ fn what_nobody_asks_for_is_handed_to_nobody() {
     view(&mut world, &id("e/r")).topics.clear();
     view(&mut world, &best).state = FlowState::Draining;
     assert_eq!(carriers(&world), []);
-    assert_eq!(
-        [&best, &second].map(|flow| plan_of(&world, flow, None).carrier),
-        [None, None]
-    );
+    assert_eq!([&best, &second].map(|flow| plan_of(&world, flow, None).carrier), [None, None]);
 }
 
 /// The receiver in a plan of the robot.
@@ -227,7 +210,9 @@ fn whoever_a_sender_has_chosen_takes_it_in_and_so_does_the_one_that_it_will_choo
     let robot = id("e/r");
     let best = receiver(&plan_of(&world, &robot, None));
     let other = FLOWS.map(id).into_iter().find(|flow| *flow != best).unwrap();
-    let takes = |world: &World, flow: &FlowId| plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer);
+    let takes = |world: &World, flow: &FlowId| {
+        plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer)
+    };
     assert!(takes(&world, &best) && !takes(&world, &other));
     view(&mut world, &robot).parts.entry(topic()).or_default().receivers = vec![other.clone()];
     assert!(takes(&world, &best) && takes(&world, &other));
@@ -247,11 +232,7 @@ fn who_has_lost_the_layer_broker_is_not_sent_to_while_another_one_has_it() {
     for flow in FLOWS.map(id) {
         view(&mut world, &flow).layer_away = true;
     }
-    assert_eq!(
-        receiver(&plan_of(&world, &robot, Some(&first))),
-        best,
-        "it is away for all"
-    );
+    assert_eq!(receiver(&plan_of(&world, &robot, Some(&first))), best, "it is away for all");
     for flow in FLOWS.map(id) {
         view(&mut world, &flow).layer_away = false;
     }
@@ -266,7 +247,9 @@ fn of_more_receivers_than_a_sender_can_name_each_that_could_be_one_takes_it_in()
     let mut world = fog_that_listens();
     let robot = id("e/r");
     let best = receiver(&plan_of(&world, &robot, None));
-    let takes = |world: &World, flow: &FlowId| plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer);
+    let takes = |world: &World, flow: &FlowId| {
+        plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer)
+    };
     let others = || FLOWS.map(id).into_iter().filter(|flow| *flow != best);
     assert!(others().all(|flow| !takes(&world, &flow)));
     let part = view(&mut world, &robot).parts.entry(topic()).or_default();
@@ -274,7 +257,8 @@ fn of_more_receivers_than_a_sender_can_name_each_that_could_be_one_takes_it_in()
     assert!(takes(&world, &best) && others().all(|flow| takes(&world, &flow)));
 }
 
-/// Missing layers, and two layers of one kind: the flows | the sender | its copies | layers that they go to | name.
+/// Missing layers, and two layers of one kind: the flows | the sender | its copies | layers that
+/// they go to | name.
 const SYSTEMS: &str = "
     e/r node+, c/a@1 layer- | e/r | 1 | 1 | no fog: the robot sends to the cloud
     e/r node+, c/a@1 layer-, c/b@1 layer- | e/r | 1 | 1 | no fog, two in the cloud: one copy
@@ -299,7 +283,8 @@ fn incomplete_systems_and_doubled_layers() {
     }
 }
 
-/// However the claims lie: at most one of the living ends up with it, and after each has done what it plans exactly one.
+/// However the claims lie: at most one of the living ends up with it, and after each has done what
+/// it plans exactly one.
 #[test]
 fn any_claims_end_with_one_carrier() {
     for seed in 0..3_u32.pow(3) * 2_u32.pow(3) {

@@ -1,8 +1,9 @@
-//! One message through all plans, by the rules of scopes and flows alone; it knows nothing of how plans are made.
+//! One message through all plans, by the rules of scopes and flows alone; it knows nothing of how
+//! plans are made.
 //!
-//! A scope gives what is written to it to its services and to every flow that reads it. A flow that reads back what it
-//! wrote drops it as an echo. Everything else that a flow or a scope sees twice is a fault here, although real flows drop
-//! repeats.
+//! A scope gives what is written to it to its services and to every flow that reads it. A flow that
+//! reads back what it wrote drops it as an echo. Everything else that a flow or a scope sees twice
+//! is a fault here, although real flows drop repeats.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -67,9 +68,7 @@ pub(super) fn is_live(view: &FlowView) -> bool {
 }
 
 fn wants(request: &Request, message: &Message) -> bool {
-    let same_type = [&request.type_name, &message.type_name]
-        .iter()
-        .any(|name| name.is_empty())
+    let same_type = [&request.type_name, &message.type_name].iter().any(|name| name.is_empty())
         || request.type_name == message.type_name;
     same_type && wants_origin(request, message)
 }
@@ -83,22 +82,18 @@ fn wants_origin(request: &Request, message: &Message) -> bool {
 }
 
 impl<'a> Simulation<'a> {
-    pub(super) fn new(system: &'a System, plans: &'a BTreeMap<FlowId, TopicPlan>, intake: Intake) -> Self {
-        Self {
-            system,
-            plans,
-            intake,
-            useful: BTreeSet::new(),
-            carried: 0,
-            relayed: 0,
-        }
+    pub(super) fn new(
+        system: &'a System,
+        plans: &'a BTreeMap<FlowId, TopicPlan>,
+        intake: Intake,
+    ) -> Self {
+        Self { system, plans, intake, useful: BTreeSet::new(), carried: 0, relayed: 0 }
     }
 
     /// Sends one message of each service that publishes, then looks for bridges that did nothing.
     pub(super) fn run(&mut self) -> Result<(), String> {
         for message in self.messages() {
-            self.send(&message)
-                .map_err(|fault| format!("{fault}\nmessage {message:?}"))?;
+            self.send(&message).map_err(|fault| format!("{fault}\nmessage {message:?}"))?;
         }
         if self.intake == Intake::Bridges {
             self.check_needless()?;
@@ -153,7 +148,13 @@ impl<'a> Simulation<'a> {
         messages
     }
 
-    fn messages_of(&self, place: &Place, flow: &FlowId, node: Option<&str>, advertise: &Advertise) -> Vec<Message> {
+    fn messages_of(
+        &self,
+        place: &Place,
+        flow: &FlowId,
+        node: Option<&str>,
+        advertise: &Advertise,
+    ) -> Vec<Message> {
         let message = |source| Message {
             born: place.clone(),
             layer: flow.layer.to_string(),
@@ -170,10 +171,7 @@ impl<'a> Simulation<'a> {
             Place::Bare(_) => false,
             Place::Layer(_) => self.layer_of(id).as_ref() == Some(place),
         };
-        self.flows()
-            .filter(|(id, view)| is_live(view) && reads(id))
-            .map(|(id, _)| id)
-            .collect()
+        self.flows().filter(|(id, view)| is_live(view) && reads(id)).map(|(id, _)| id).collect()
     }
 
     fn send(&mut self, message: &Message) -> Result<(), String> {
@@ -235,7 +233,8 @@ impl<'a> Simulation<'a> {
                 continue;
             };
             if scope == Scope::Layer && copy.hops > 0 {
-                let relayed = copy.hops == 1 && bridge.lane.relays(&message.layer, &message.source.node);
+                let relayed =
+                    copy.hops == 1 && bridge.lane.relays(&message.layer, &message.source.node);
                 if !relayed {
                     continue;
                 }
@@ -285,14 +284,22 @@ impl<'a> Simulation<'a> {
         framed.into_iter().chain(bare).chain(layer).collect()
     }
 
-    fn written(&self, flow: &FlowId, target: &Target, copy: &Copy, trail: Vec<BridgeKey>) -> Result<Copy, String> {
+    fn written(
+        &self,
+        flow: &FlowId,
+        target: &Target,
+        copy: &Copy,
+        trail: Vec<BridgeKey>,
+    ) -> Result<Copy, String> {
         let place = match target {
-            Target::Node { .. } if !self.view(flow).node_scope => return Err(format!("{flow} has no node scope")),
+            Target::Node { .. } if !self.view(flow).node_scope => {
+                return Err(format!("{flow} has no node scope"));
+            }
             Target::Node { bare: false } => Place::Node(flow.clone()),
             Target::Node { bare: true } => Place::Bare(flow.clone()),
-            Target::Layer => self
-                .layer_of(flow)
-                .ok_or_else(|| format!("{flow} has no layer scope"))?,
+            Target::Layer => {
+                self.layer_of(flow).ok_or_else(|| format!("{flow} has no layer scope"))?
+            }
             Target::Inter { .. } => return Err(format!("{flow} goes from inter to inter")),
         };
         Ok(Copy {
@@ -336,10 +343,7 @@ impl<'a> Simulation<'a> {
 
     fn node_requests(&self, flow: &FlowId) -> Vec<&'a Request> {
         let framed = self.requests_at(&Place::Node(flow.clone()));
-        framed
-            .into_iter()
-            .chain(self.requests_at(&Place::Bare(flow.clone())))
-            .collect()
+        framed.into_iter().chain(self.requests_at(&Place::Bare(flow.clone()))).collect()
     }
 
     fn requests_at(&self, place: &Place) -> Vec<&'a Request> {
@@ -360,7 +364,8 @@ impl<'a> Simulation<'a> {
         requests.filter(fits).collect()
     }
 
-    /// Whether the message can leave the scope where it was born for the flow or the layer that asks.
+    /// Whether the message can leave the scope where it was born for the flow or the layer that
+    /// asks.
     fn can_reach(&self, born: &Place, to: &Place) -> bool {
         let (Place::Node(to_flow) | Place::Bare(to_flow) | Place::Layer(to_flow)) = to;
         let live = |id: &FlowId| is_live(self.view(id));
@@ -373,10 +378,15 @@ impl<'a> Simulation<'a> {
             let layer = self.layer_of(flow);
             let inside = |id: &FlowId| live(id) && self.view(id).role.is_inside();
             let mut flows = self.flows().map(|(id, _)| id);
-            flows.any(|id| inside(id) && (id == flow || (layer.is_some() && self.layer_of(id) == layer)))
+            flows.any(|id| {
+                inside(id) && (id == flow || (layer.is_some() && self.layer_of(id) == layer))
+            })
         };
         let one_group = self.group_of(born) == self.group_of(to);
-        born == to || (!self.readers(born).is_empty() && to_live && (one_group || (joined(born) && joined(to))))
+        born == to
+            || (!self.readers(born).is_empty()
+                && to_live
+                && (one_group || (joined(born) && joined(to))))
     }
 
     /// The layer scope that a place belongs to, or the flow that has none.
@@ -386,7 +396,11 @@ impl<'a> Simulation<'a> {
     }
 
     /// Every request that matches was served once.
-    fn check_served(&self, message: &Message, arrived: &BTreeMap<Place, bool>) -> Result<(), String> {
+    fn check_served(
+        &self,
+        message: &Message,
+        arrived: &BTreeMap<Place, bool>,
+    ) -> Result<(), String> {
         for (place, entry) in self.places() {
             let Some(request) = &entry.request else { continue };
             if !wants(request, message) {
@@ -411,7 +425,8 @@ impl<'a> Simulation<'a> {
         Ok(())
     }
 
-    /// Every bridge carried something towards a requester, or waits beside an intake that a sender could move away.
+    /// Every bridge carried something towards a requester, or waits beside an intake that a sender
+    /// could move away.
     fn check_needless(&self) -> Result<(), String> {
         for (flow, plan) in self.plans {
             for bridge in &plan.bridges {
@@ -427,8 +442,9 @@ impl<'a> Simulation<'a> {
         Ok(())
     }
 
-    /// A bridge from the layer to the node of a flow that takes the same from the inter scope, while another flow of the
-    /// layer asks for something of the same publishing scope too, so that its sender may have chosen that one.
+    /// A bridge from the layer to the node of a flow that takes the same from the inter scope,
+    /// while another flow of the layer asks for something of the same publishing scope too, so that
+    /// its sender may have chosen that one.
     fn stands_by(&self, flow: &FlowId, from: Scope, to: &Target) -> bool {
         if !self.view(flow).role.is_inside() && (from == Scope::Layer || *to == Target::Layer) {
             // It is not told which origins there are outside.
@@ -449,16 +465,23 @@ impl<'a> Simulation<'a> {
             .into_iter()
             .filter(|other| *other != flow)
             .partition(|other| self.view(other).role.is_inside());
-        let for_members = |born: &Place| members.iter().any(|other| wanted(&self.node_requests(other), born));
+        let for_members =
+            |born: &Place| members.iter().any(|other| wanted(&self.node_requests(other), born));
         messages.iter().map(|message| &message.born).any(|born| {
             let outside = match born {
-                Place::Node(born) | Place::Bare(born) => self.layer_of(born).as_ref() != Some(&layer),
+                Place::Node(born) | Place::Bare(born) => {
+                    self.layer_of(born).as_ref() != Some(&layer)
+                }
                 Place::Layer(_) => *born != layer,
             };
-            let could =
-                |other: &FlowId| wanted(&shared, born) || wanted(&self.node_requests(other), born) || for_members(born);
+            let could = |other: &FlowId| {
+                wanted(&shared, born)
+                    || wanted(&self.node_requests(other), born)
+                    || for_members(born)
+            };
             let sent = outside && !self.readers(born).is_empty();
-            sent && wanted(&self.node_requests(flow), born) && others.iter().any(|other| could(other))
+            sent && wanted(&self.node_requests(flow), born)
+                && others.iter().any(|other| could(other))
         })
     }
 }

@@ -4,7 +4,9 @@ use blaze_domain::node_file::{TopicRule, TopicValues};
 use blaze_domain::{Durability, Priority, Reliability, Scope, WhyCode};
 
 use super::worlds::{ask, entry, filter, id, list, offer, rows, topic, ways, world};
-use crate::plan::{Delivery, Destination, PlanRules, Target, TopicPlan, delivery, owner, plan_topic};
+use crate::plan::{
+    Delivery, Destination, PlanRules, Target, TopicPlan, delivery, owner, plan_topic,
+};
 use crate::world::{Reach, Source, World};
 
 fn plan(world: &World) -> TopicPlan {
@@ -53,18 +55,14 @@ fn bridges_of_each_rule() {
 
 /// The same world as another flow sees it.
 fn seen_by(world: &World, flow: &str) -> World {
-    World {
-        me: id(flow),
-        ..world.clone()
-    }
+    World { me: id(flow), ..world.clone() }
 }
 
 #[test]
 fn one_replica_owns_a_topic_of_the_layer_and_one_receives_it() {
     let world = world(&["f/a@1 layer+", "f/b@1 layer+", "c/x@1 layer-", "c/y@1 layer-"]);
-    let all: Vec<_> = ["f/a", "f/b", "c/x", "c/y"]
-        .map(|flow| ways(&plan(&seen_by(&world, flow))))
-        .concat();
+    let all: Vec<_> =
+        ["f/a", "f/b", "c/x", "c/y"].map(|flow| ways(&plan(&seen_by(&world, flow)))).concat();
     assert_eq!(all.len(), 2, "one sends, one receives: {all:?}");
     let receiver = all[0].strip_prefix("layer>").unwrap();
     assert_eq!(ways(&plan(&seen_by(&world, receiver))), ["inter>layer"]);
@@ -78,16 +76,10 @@ fn a_flow_with_a_requester_of_its_own_receives_for_the_layer() {
     assert_eq!(ways(&plan(&with_request)), ["node>c/w"]);
     let mut two = world(&["e/a node+", "c/v@1 node-", "c/w@1 node-"]);
     let chosen = ways(&plan(&two))[0].clone();
-    let (receiver, other) = if chosen == "node>c/v" {
-        ("c/v", "c/w")
-    } else {
-        ("c/w", "c/v")
-    };
-    // The receiver keeps the way from the layer too: a sender with an earlier choice may stay with the other one.
-    assert_eq!(
-        ways(&plan(&seen_by(&two, receiver))),
-        ["layer>node", "inter>node", "inter>layer"]
-    );
+    let (receiver, other) = if chosen == "node>c/v" { ("c/v", "c/w") } else { ("c/w", "c/v") };
+    // The receiver keeps the way from the layer too: a sender with an earlier choice may stay with
+    // the other one.
+    assert_eq!(ways(&plan(&seen_by(&two, receiver))), ["layer>node", "inter>node", "inter>layer"]);
     assert_eq!(ways(&plan(&seen_by(&two, other))), ["layer>node"]);
     // Only the other one asks for this publisher: it is the receiver.
     ask(&mut two, receiver, "node").from = vec![filter("c/*/*")];
@@ -98,26 +90,18 @@ fn a_flow_with_a_requester_of_its_own_receives_for_the_layer() {
 fn a_receiver_stays_when_a_better_one_joins() {
     let mut world = world(&["e/a node+", "c/v@1 node-", "c/w@1 node-"]);
     let chosen = plan(&world).bridges[0].to.clone();
-    let Target::Inter { receiver, .. } = &chosen else {
-        panic!("{chosen:?}")
-    };
+    let Target::Inter { receiver, .. } = &chosen else { panic!("{chosen:?}") };
     let best = world.flows.remove(receiver).unwrap();
     let second = plan(&world);
     world.flows.insert(receiver.clone(), best);
     let again = |world: &World| plan_topic(world, &topic(), &PlanRules::default(), Some(&second));
     assert_eq!(again(&world), second, "the flow that joins takes nothing over");
-    let Target::Inter { receiver: other, .. } = &second.bridges[0].to else {
-        panic!("{second:?}")
-    };
+    let Target::Inter { receiver: other, .. } = &second.bridges[0].to else { panic!("{second:?}") };
     world.flows.get_mut(other).unwrap().reach = Reach::Down;
     assert_eq!(again(&world).bridges[0].to, chosen, "a receiver that is down is left");
     world.flows.get_mut(other).unwrap().reach = Reach::Up;
     world.flows.get_mut(other).unwrap().topics.clear();
-    assert_eq!(
-        again(&world).bridges[0].to,
-        chosen,
-        "so is one that has no requester any more"
-    );
+    assert_eq!(again(&world).bridges[0].to, chosen, "so is one that has no requester any more");
 }
 
 #[test]
@@ -137,13 +121,11 @@ fn filters_decide_who_is_connected() {
     for (text, service, more_sources, node, connected) in rows {
         for scope in ["node", "layer"] {
             let mut world = world(&["e/a@1 node+ layer+", "c/b node-"]);
-            entry(&mut world, "e/a", if scope == "node" { "layer" } else { "node" }).advertise = None;
+            entry(&mut world, "e/a", if scope == "node" { "layer" } else { "node" }).advertise =
+                None;
             let offer = offer(&mut world, "e/a", scope);
             offer.more_sources = more_sources;
-            offer.sources = vec![Source {
-                node: node.to_owned(),
-                service: service.to_owned(),
-            }];
+            offer.sources = vec![Source { node: node.to_owned(), service: service.to_owned() }];
             ask(&mut world, "c/b", "node").from = vec![filter("nowhere/*/*"), filter(text)];
             let plan = plan(&world);
             assert_eq!(plan.bridges.len(), usize::from(connected), "{text} {scope}");
@@ -168,18 +150,12 @@ fn a_layer_service_without_a_node_matches_no_filter_by_node() {
 fn filters_hold_inside_a_layer_too_and_lanes_carry_their_union() {
     let mut world = world(&["e/a@1 node+", "e/b@1 node-", "e/c@1 node- layer-"]);
     ask(&mut world, "e/b", "node").from = vec![filter("e/b/*")];
-    assert!(
-        ways(&plan(&seen_by(&world, "e/b"))).is_empty(),
-        "its filter matches nobody"
-    );
+    assert!(ways(&plan(&seen_by(&world, "e/b"))).is_empty(), "its filter matches nobody");
     ask(&mut world, "e/b", "node").from = vec![filter("e/a/*"), filter("c/*/*")];
     ask(&mut world, "e/c", "node").from = vec![filter("e/*/*")];
     ask(&mut world, "e/c", "layer").from = vec![filter("e/a/*")];
     let plan = plan(&world);
-    assert_eq!(
-        plan.bridges[0].lane.from,
-        [filter("c/*/*"), filter("e/*/*"), filter("e/a/*")]
-    );
+    assert_eq!(plan.bridges[0].lane.from, [filter("c/*/*"), filter("e/*/*"), filter("e/a/*")]);
     ask(&mut world, "e/c", "layer").from.clear();
     assert_eq!(super::table::plan(&world).bridges[0].lane.from, []);
 }
@@ -225,10 +201,7 @@ fn who_is_blocked_is_said_once_by_those_who_have_a_part_in_it() {
     ask(&mut world, "c/b", "layer").from = vec![filter("x/*/*")];
     let codes = |flow: &str| -> Vec<_> {
         let plan = plan(&seen_by(&world, flow));
-        plan.blocked
-            .into_iter()
-            .map(|blocked| (blocked.to, blocked.code))
-            .collect()
+        plan.blocked.into_iter().map(|blocked| (blocked.to, blocked.code)).collect()
     };
     let layer = Destination::Layer("c".parse().unwrap());
     let flow = Destination::Flow(id("c/d"));
@@ -255,11 +228,7 @@ fn reliable_and_durable_need_both_sides() {
         assert_eq!((lane.reliable, lane.durable), (carried, false));
 
         let durability = |r| {
-            if r == R::Reliable {
-                D::TransientLocal
-            } else {
-                D::Volatile
-            }
+            if r == R::Reliable { D::TransientLocal } else { D::Volatile }
         };
         let mut world = super::worlds::world(&["e/a node+", "c/b node-"]);
         offer(&mut world, "e/a", "node").durability = durability(offered);
@@ -336,10 +305,7 @@ fn the_operator_bounds_rate_and_lifespan_and_sets_the_class() {
         max_rate_hz: Some(15.0),
         ..TopicValues::default()
     };
-    let short = TopicValues {
-        lifespan_ms: Some(500),
-        ..TopicValues::default()
-    };
+    let short = TopicValues { lifespan_ms: Some(500), ..TopicValues::default() };
     // What one rule leaves open, a later one that matches too may say.
     let rules = PlanRules {
         topics: vec![
@@ -349,13 +315,12 @@ fn the_operator_bounds_rate_and_lifespan_and_sets_the_class() {
             rule("imu/**", fast),
         ],
     };
-    for (rate, lifespan, expected) in [
-        (None, 0, (15.0, 500)),
-        (Some(20.0), 900, (15.0, 500)),
-        (Some(5.0), 100, (5.0, 100)),
-    ] {
+    for (rate, lifespan, expected) in
+        [(None, 0, (15.0, 500)), (Some(20.0), 900, (15.0, 500)), (Some(5.0), 100, (5.0, 100))]
+    {
         let request = ask(&mut world, "c/b", "node");
-        (request.max_rate_hz, request.lifespan_ms, request.priority) = (rate, lifespan, Some(Priority::Bulk));
+        (request.max_rate_hz, request.lifespan_ms, request.priority) =
+            (rate, lifespan, Some(Priority::Bulk));
         let lane = plan_topic(&world, &topic(), &rules, None).bridges[0].lane.clone();
         assert_eq!((lane.max_rate_hz, lane.lifespan_ms), (Some(expected.0), expected.1));
         assert_eq!(lane.priority, Some(Priority::Control));
@@ -365,16 +330,16 @@ fn the_operator_bounds_rate_and_lifespan_and_sets_the_class() {
 #[test]
 fn what_arrives_is_delivered_whether_chosen_or_not() {
     let world = world(&["e/a node+", "c/v@1 node-", "c/w@1 node-b"]);
-    let at = |flow: &str| -> Delivery { delivery(&seen_by(&world, flow), &topic(), &PlanRules::default()) };
+    let at = |flow: &str| -> Delivery {
+        delivery(&seen_by(&world, flow), &topic(), &PlanRules::default())
+    };
     let there = |d: &Delivery| [d.node_framed.is_some(), d.node_bare.is_some(), d.layer.is_some()];
     assert_eq!(there(&at("c/v")), [true, false, true]);
     assert_eq!(there(&at("c/w")), [false, true, true]);
     assert_eq!(there(&at("e/a")), [false; 3]);
     for flow in ["c/v", "c/w"] {
-        for bridge in plan(&seen_by(&world, flow))
-            .bridges
-            .iter()
-            .filter(|bridge| bridge.from == Scope::Inter)
+        for bridge in
+            plan(&seen_by(&world, flow)).bridges.iter().filter(|bridge| bridge.from == Scope::Inter)
         {
             let delivery = at(flow);
             let lane = match bridge.to {
@@ -382,11 +347,7 @@ fn what_arrives_is_delivered_whether_chosen_or_not() {
                 Target::Node { bare: true } => delivery.node_bare,
                 _ => delivery.layer,
             };
-            assert_eq!(
-                lane.as_ref(),
-                Some(&bridge.lane),
-                "a bridge is what is delivered anyway"
-            );
+            assert_eq!(lane.as_ref(), Some(&bridge.lane), "a bridge is what is delivered anyway");
         }
     }
 }

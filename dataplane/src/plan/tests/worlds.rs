@@ -9,8 +9,8 @@ use serde_json::{Value, json};
 use crate::plan::{Bridge, Target, TopicPlan};
 use crate::testing::access;
 use crate::world::{
-    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, ScopeEntry,
-    Source, TopicEntry, World,
+    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request,
+    Role, ScopeEntry, Source, TopicEntry, World,
 };
 
 pub(crate) fn topic() -> TopicName {
@@ -33,10 +33,7 @@ pub(crate) fn advertise() -> Advertise {
         depth: 1,
         priority: None,
         lifespan_ms: 0,
-        sources: vec![Source {
-            node: String::new(),
-            service: "driver".to_owned(),
-        }],
+        sources: vec![Source { node: String::new(), service: "driver".to_owned() }],
         more_sources: false,
     }
 }
@@ -66,11 +63,7 @@ pub(crate) fn rules(mut rule: Value) -> AccessRules {
 /// A filter written `layer/node/service`, where `*` is any.
 pub(crate) fn filter(text: &str) -> OriginFilter {
     let part = |n: usize| text.split('/').nth(n).filter(|part| *part != "*").map(str::to_owned);
-    OriginFilter {
-        layer: part(0),
-        node: part(1),
-        service: part(2),
-    }
+    OriginFilter { layer: part(0), node: part(1), service: part(2) }
 }
 
 pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
@@ -82,10 +75,11 @@ pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
     }
 }
 
-/// A world written as one line per flow: `edge/a@1 node+ layer-`: `@1` is its layer broker, `+` an advertisement on
-/// that scope, `-` a request, `-b` a request for bare payloads; `down`, `suspect`, `starting`, `draining` and `settled` as
-/// they read; `away`: its layer broker does not answer it; `many`: it sends to more flows than it names; `carries` and `handed` say who carries the topic out of the layer, `>c/b` whom it is sent to. The first flow is
-/// `me`.
+/// A world written as one line per flow: `edge/a@1 node+ layer-`: `@1` is its layer broker, `+` an
+/// advertisement on that scope, `-` a request, `-b` a request for bare payloads; `down`, `suspect`,
+/// `starting`, `draining` and `settled` as they read; `away`: its layer broker does not answer it;
+/// `many`: it sends to more flows than it names; `carries` and `handed` say who carries the topic
+/// out of the layer, `>c/b` whom it is sent to. The first flow is `me`.
 pub(crate) fn world(lines: &[&str]) -> World {
     let mut flows = BTreeMap::new();
     let mut me = None;
@@ -119,11 +113,7 @@ pub(crate) fn world(lines: &[&str]) -> World {
                 "node-" => entry.node.request = Some(request()),
                 "layer-" => entry.layer.request = Some(request()),
                 "node-b" => {
-                    entry.node.request = Some(Request {
-                        framed: false,
-                        bare: true,
-                        ..request()
-                    });
+                    entry.node.request = Some(Request { framed: false, bare: true, ..request() });
                 }
                 other => panic!("{other}"),
             }
@@ -135,22 +125,12 @@ pub(crate) fn world(lines: &[&str]) -> World {
         me.get_or_insert_with(|| id(name));
         flows.insert(id(name), view);
     }
-    World {
-        me: me.unwrap(),
-        flows,
-        access: AccessRules::default(),
-    }
+    World { me: me.unwrap(), flows, access: AccessRules::default() }
 }
 
 /// What a flow says of the topic on one scope.
 pub(crate) fn entry<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mut ScopeEntry {
-    let entry = world
-        .flows
-        .get_mut(&id(flow))
-        .unwrap()
-        .topics
-        .entry(topic())
-        .or_default();
+    let entry = world.flows.get_mut(&id(flow)).unwrap().topics.entry(topic()).or_default();
     match scope {
         "node" => &mut entry.node,
         _ => &mut entry.layer,

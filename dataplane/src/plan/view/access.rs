@@ -1,7 +1,8 @@
 //! What the rules `flow.access` of the own node file mean for services of other flows.
 //!
-//! Services of the own brokers had their leases looked at. Of others a flow hears which scopes ask and who publishes there, so the
-//! rules are held against layer and node; what nobody tells is empty, and fits `*` alone.
+//! Services of the own brokers had their leases looked at. Of others a flow hears which scopes ask
+//! and who publishes there, so the rules are held against layer and node; what nobody tells is
+//! empty, and fits `*` alone.
 
 use blaze_domain::control::LeaseKind;
 use blaze_domain::{FlowId, Scope};
@@ -18,7 +19,8 @@ impl<'w> TopicView<'w> {
         }
         let (layer, node) = match requester.scope {
             Scope::Node => (flow.layer.as_str(), flow.node.as_str()),
-            // All flows of the group hear these services, so whom of them the rules allow has a lease here.
+            // All flows of the group hear these services, so whom of them the rules allow has a
+            // lease here.
             Scope::Layer if requester.group == self.group => return self.leases_on_layer(),
             Scope::Layer => (flow.layer.as_str(), ""),
             Scope::Inter => ("", ""),
@@ -31,9 +33,14 @@ impl<'w> TopicView<'w> {
         own.is_some_and(|entry| entry.layer.request.is_some())
     }
 
-    /// Requesters that the own rules refuse, and that other flows count among those that could take in what the publisher sends
-    /// to a group: of the own group any, of others those whom another flow sends it.
-    pub(super) fn refused_elsewhere(&self, publisher: &Publisher<'_>, group: Group<'_>) -> &[Requester<'w>] {
+    /// Requesters that the own rules refuse, and that other flows count among those that could take
+    /// in what the publisher sends to a group: of the own group any, of others those whom another
+    /// flow sends it.
+    pub(super) fn refused_elsewhere(
+        &self,
+        publisher: &Publisher<'_>,
+        group: Group<'_>,
+    ) -> &[Requester<'w>] {
         if self.refused.is_empty() || (group != self.group && self.sends(publisher)) {
             &[]
         } else {
@@ -42,7 +49,11 @@ impl<'w> TopicView<'w> {
     }
 
     /// Why the rules keep from the requester what the publisher sends, if they do.
-    pub(crate) fn denial(&self, publisher: &Publisher<'w>, requester: &Requester<'w>) -> Option<String> {
+    pub(crate) fn denial(
+        &self,
+        publisher: &Publisher<'w>,
+        requester: &Requester<'w>,
+    ) -> Option<String> {
         let is_refused = self.is_refused(requester) && !self.is_served_along(publisher, requester);
         let (who, what) = if is_refused {
             (place(requester.flow, requester.scope), LeaseKind::Request)
@@ -52,12 +63,13 @@ impl<'w> TopicView<'w> {
             return None;
         };
         let (me, topic) = (self.me, self.topic);
-        self.passes(publisher, requester)
-            .then(|| format!("{who} may not {what} {topic}: the rules flow.access of {me} do not allow it"))
+        self.passes(publisher, requester).then(|| {
+            format!("{who} may not {what} {topic}: the rules flow.access of {me} do not allow it")
+        })
     }
 
-    /// Requests that the rules leave without an answer, and why: whoever is refused, and whoever is reached by none but those who
-    /// may not publish.
+    /// Requests that the rules leave without an answer, and why: whoever is refused, and whoever is
+    /// reached by none but those who may not publish.
     pub(super) fn denied(&self) -> Vec<(Destination, String)> {
         let denies = self.access.limits(LeaseKind::Advertise);
         if self.refused.is_empty() && !denies {
@@ -65,17 +77,17 @@ impl<'w> TopicView<'w> {
         }
         let of = |requester: &Requester<'w>| {
             let requester = *requester;
-            let publishers = self
-                .publishers
-                .iter()
-                .filter(move |publisher| publisher.matches(&requester));
+            let publishers =
+                self.publishers.iter().filter(move |publisher| publisher.matches(&requester));
             publishers.map(move |publisher| self.denial(publisher, &requester))
         };
         let refused = self.refused.iter().filter_map(|requester| {
             let denial = of(requester).flatten().next()?;
             Some((requester.destination(), denial))
         });
-        let here = |requester: &&Requester<'w>| requester.group == self.group && requester.scope != Scope::Inter;
+        let here = |requester: &&Requester<'w>| {
+            requester.group == self.group && requester.scope != Scope::Inter
+        };
         let unheard = self.requesters.iter().filter(|_| denies).filter(here);
         let unheard = unheard.filter_map(|requester| {
             let denials: Option<Vec<String>> = of(requester).collect();
@@ -85,14 +97,17 @@ impl<'w> TopicView<'w> {
     }
 
     fn is_refused(&self, requester: &Requester<'_>) -> bool {
-        let same = |refused: &Requester<'_>| (refused.flow, refused.scope) == (requester.flow, requester.scope);
+        let same = |refused: &Requester<'_>| {
+            (refused.flow, refused.scope) == (requester.flow, requester.scope)
+        };
         self.refused.iter().any(same)
     }
 
-    /// Whether what the publisher sends goes the requester's way for another one all the same: what is on the broker of a layer
-    /// everybody there may read.
+    /// Whether what the publisher sends goes the requester's way for another one all the same: what
+    /// is on the broker of a layer everybody there may read.
     fn is_served_along(&self, publisher: &Publisher<'w>, requester: &Requester<'w>) -> bool {
-        let over_layer = |other: &Requester<'_>| other.flow != self.me || other.scope == Scope::Layer;
+        let over_layer =
+            |other: &Requester<'_>| other.flow != self.me || other.scope == Scope::Layer;
         let same_way = |other: &&Requester<'w>| {
             other.group == requester.group && (requester.group != self.group || over_layer(other))
         };
@@ -100,7 +115,8 @@ impl<'w> TopicView<'w> {
         others.any(|other| publisher.matches(other))
     }
 
-    /// Whether the rules let none of those advertise the topic who are known to publish there, in another group.
+    /// Whether the rules let none of those advertise the topic who are known to publish there, in
+    /// another group.
     fn is_denied(&self, publisher: &Publisher<'_>) -> bool {
         let (flow, advertise) = (publisher.flow, publisher.advertise);
         let outside = publisher.group != self.group && publisher.scope != Scope::Inter;
@@ -108,18 +124,15 @@ impl<'w> TopicView<'w> {
             return false;
         }
         let may = |node: &str, service: &str| {
-            let node = if publisher.scope == Scope::Node {
-                flow.node.as_str()
-            } else {
-                node
-            };
-            self.access
-                .allows(LeaseKind::Advertise, flow.layer.as_str(), node, service)
+            let node = if publisher.scope == Scope::Node { flow.node.as_str() } else { node };
+            self.access.allows(LeaseKind::Advertise, flow.layer.as_str(), node, service)
         };
         let sources = &advertise.sources;
         // A message without header is of no known service where several advertise.
         let may_unnamed = sources.len() > 1 && may("", "");
-        !sources.is_empty() && !may_unnamed && !sources.iter().any(|source| may(&source.node, &source.service))
+        !sources.is_empty()
+            && !may_unnamed
+            && !sources.iter().any(|source| may(&source.node, &source.service))
     }
 
     /// Whether this flow sends other groups what is published there.
@@ -134,8 +147,8 @@ impl<'w> TopicView<'w> {
         (publisher.scope == Scope::Layer || is_relayed()) && self.owner() == Some(self.me)
     }
 
-    /// Whether what the publisher sends comes through this flow on its way to the requester, as far as others are concerned: what the
-    /// own node gets from the layer scope does not.
+    /// Whether what the publisher sends comes through this flow on its way to the requester, as far
+    /// as others are concerned: what the own node gets from the layer scope does not.
     fn passes(&self, publisher: &Publisher<'w>, requester: &Requester<'w>) -> bool {
         if requester.group != self.group {
             return self.sends(publisher);
@@ -144,7 +157,8 @@ impl<'w> TopicView<'w> {
             let own_node = publisher.flow == self.me && publisher.scope == Scope::Node;
             return own_node && !meets_directly(publisher, requester);
         }
-        // What is published on a layer scope is told by all flows of the layer, and one of them sends it.
+        // What is published on a layer scope is told by all flows of the layer, and one of them
+        // sends it.
         let same = |other: &&Publisher<'w>| {
             let of_layer = publisher.scope == Scope::Layer && other.scope == Scope::Layer;
             let of_node = (other.flow, other.scope) == (publisher.flow, publisher.scope);

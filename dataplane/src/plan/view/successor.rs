@@ -7,8 +7,12 @@ use crate::plan::rendezvous;
 use crate::world::{Carrying, Hold, Reach};
 
 impl<'w> TopicView<'w> {
-    /// Who is to carry what this flow carries, of those that could: itself, unless it gives the topic to another one.
-    pub(super) fn successor(&self, mut able: impl Iterator<Item = &'w FlowId>) -> Option<&'w FlowId> {
+    /// Who is to carry what this flow carries, of those that could: itself, unless it gives the
+    /// topic to another one.
+    pub(super) fn successor(
+        &self,
+        mut able: impl Iterator<Item = &'w FlowId>,
+    ) -> Option<&'w FlowId> {
         let hold = self.part_of(self.me).map_or(&Hold::Hashing, |part| &part.hold);
         match hold {
             Hold::Hashing => {
@@ -21,7 +25,11 @@ impl<'w> TopicView<'w> {
     }
 
     /// The flow that a topic was given to which nobody carries, if it could.
-    pub(super) fn given_to(&self, group: Group<'w>, mut able: impl Iterator<Item = &'w FlowId>) -> Option<&'w FlowId> {
+    pub(super) fn given_to(
+        &self,
+        group: Group<'w>,
+        mut able: impl Iterator<Item = &'w FlowId>,
+    ) -> Option<&'w FlowId> {
         let of_group = self.world.flows.iter().filter(|(id, flow)| {
             // Of itself a flow knows that it lives.
             (flow.reach != Reach::Down || *id == self.me) && Group::of(id, flow) == group

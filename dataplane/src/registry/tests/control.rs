@@ -87,10 +87,7 @@ fn a_lease_is_granted_renewed_and_lapses() {
     let mut desk = Desk::new();
     let advertise = json!({"op": "advertise", "topic": "imu", "service": "driver", "rate_hz": 50});
     let body = desk.answer(Scope::Node, &advertise);
-    assert_eq!(
-        body,
-        json!({"id": "7", "ok": true, "flow": "edge/robot-1", "lease_s": 15})
-    );
+    assert_eq!(body, json!({"id": "7", "ok": true, "flow": "edge/robot-1", "lease_s": 15}));
     desk.wait(10_000);
     let renewed = desk.now;
     let outcome = desk.node(&advertise);
@@ -117,7 +114,14 @@ fn a_lease_is_granted_renewed_and_lapses() {
 fn a_lease_without_end_stays_until_withdrawn() {
     let mut desk = Desk::new();
     let both = json!([
-        {"op": "advertise", "topic": "imu", "service": "a", "ttl_s": 0, "id": "1", "reply_to": "blaze/reply/x"},
+        {
+            "op": "advertise",
+            "topic": "imu",
+            "service": "a",
+            "ttl_s": 0,
+            "id": "1",
+            "reply_to": "blaze/reply/x",
+        },
         {"op": "request", "topic": "imu", "service": "a", "ttl_s": 0}
     ]);
     assert_eq!(desk.node(&both).answers[0].body["lease_s"], 0);
@@ -152,17 +156,15 @@ fn the_source_must_be_where_it_is_received() {
     ] {
         assert_eq!(desk.says_on(scope, &from(key, value)), says);
     }
-    // On node scope both names mean the same lease; on layer scope an absent node is a holder of its own.
+    // On node scope both names mean the same lease; on layer scope an absent node is a holder of
+    // its own.
     desk.send(Scope::Layer, &object("advertise", "imu", "a"));
     let leases = desk.registry.leases();
     let nodes: Vec<_> = leases
         .map(|lease| (lease.key.scope, lease.key.node.as_ref().map(ToString::to_string)))
         .collect();
     let (first, second) = (Some("robot-1".to_owned()), Some("robot-2".to_owned()));
-    assert_eq!(
-        nodes,
-        [(Scope::Node, first), (Scope::Layer, None), (Scope::Layer, second)]
-    );
+    assert_eq!(nodes, [(Scope::Node, first), (Scope::Layer, None), (Scope::Layer, second)]);
     let outcome = desk.node(&json!([from("layer", "edge"), from("layer", "fog")]));
     assert_eq!(outcome.faults, 1);
     assert!(outcome.events[0].detail.contains("/1/layer"), "{:?}", outcome.events);
@@ -171,7 +173,8 @@ fn the_source_must_be_where_it_is_received() {
 #[test]
 fn an_older_life_cannot_touch_a_live_lease() {
     let mut desk = Desk::new();
-    let with = |op: &str, epoch: u64| json!({"op": op, "topic": "imu", "service": "a", "epoch": epoch});
+    let with =
+        |op: &str, epoch: u64| json!({"op": op, "topic": "imu", "service": "a", "epoch": epoch});
     for (op, epoch, says) in [
         ("advertise", 5, "ok"),
         ("advertise", 4, "stale_epoch /epoch"),
@@ -190,10 +193,7 @@ fn an_older_life_cannot_touch_a_live_lease() {
 
 #[test]
 fn leases_are_bounded() {
-    let mut desk = Desk::with(|config| RegistryConfig {
-        max_leases: 3,
-        ..config
-    });
+    let mut desk = Desk::with(|config| RegistryConfig { max_leases: 3, ..config });
     let advertise = |topic: &str| object("advertise", topic, "a");
     for name in ["a", "b", "c"] {
         assert_eq!(desk.says(&advertise(name)), "ok");
@@ -210,7 +210,8 @@ fn leases_are_bounded() {
 fn what_is_refused_is_remembered_until_it_is_granted() {
     let layer_names = LayerNames::Kafka { prefix_bytes: 50 };
     let mut desk = Desk::with(|config| RegistryConfig { layer_names, ..config });
-    let mut elsewhere = json!({"op": "request", "topic": "imu/data", "service": "a", "layer": "fog"});
+    let mut elsewhere =
+        json!({"op": "request", "topic": "imu/data", "service": "a", "layer": "fog"});
     desk.node(&elsewhere);
     assert_eq!(desk.missing("imu/data"), [LapseReason::SourceMismatch]);
     elsewhere["layer"] = json!("edge");
@@ -232,10 +233,7 @@ fn what_is_refused_is_remembered_until_it_is_granted() {
 
 #[test]
 fn what_is_the_matter_now_comes_before_what_was() {
-    let mut desk = Desk::with(|config| RegistryConfig {
-        max_leases: 1,
-        ..config
-    });
+    let mut desk = Desk::with(|config| RegistryConfig { max_leases: 1, ..config });
     desk.node(&object("advertise", "imu", "old"));
     desk.wait(15_000);
     desk.node(&object("advertise", "odom", "other"));
@@ -249,13 +247,21 @@ fn answers_go_only_to_those_who_ask() {
     let outcome = desk.node(&json!([
         {"op": "advertise", "topic": "a", "service": "a"},
         {"op": "fly", "topic": "b", "service": "a"},
-        {"op": "request", "topic": "blaze/x", "service": "a", "id": "2", "reply_to": "blaze/reply/x"},
+        {
+            "op": "request",
+            "topic": "blaze/x",
+            "service": "a",
+            "id": "2",
+            "reply_to": "blaze/reply/x",
+        },
         {"op": "request", "topic": "c", "service": "a", "id": "3", "reply_to": "elsewhere"},
         {"op": "request", "topic": "d", "service": "a", "reply_to": "blaze/reply/y"},
     ]));
     let said = |answer: &AnswerOut| (answer.reply_to.to_string(), answer.body.to_string());
-    let [first, second]: [_; 2] = outcome.answers.iter().map(said).collect::<Vec<_>>().try_into().unwrap();
-    let begin = r#"{"id":"2","ok":false,"error":{"code":"reserved_topic","pointer":"/2/topic","detail":"#;
+    let [first, second]: [_; 2] =
+        outcome.answers.iter().map(said).collect::<Vec<_>>().try_into().unwrap();
+    let begin =
+        r#"{"id":"2","ok":false,"error":{"code":"reserved_topic","pointer":"/2/topic","detail":"#;
     assert!(first.0 == "blaze/reply/x" && first.1.starts_with(begin), "{first:?}");
     let granted = r#"{"ok":true,"flow":"edge/robot-1","lease_s":15}"#;
     assert_eq!(second, ("blaze/reply/y".to_owned(), granted.to_owned()));
@@ -273,25 +279,23 @@ fn answers_go_only_to_those_who_ask() {
 #[test]
 fn where_answers_share_a_channel_an_id_is_required() {
     let mut desk = Desk::new();
-    let object = json!({"op": "advertise", "topic": "a", "service": "a", "reply_to": "blaze/reply/x"});
+    let object =
+        json!({"op": "advertise", "topic": "a", "service": "a", "reply_to": "blaze/reply/x"});
     let outcome = desk.send(Scope::Layer, &object);
     assert_eq!(outcome.answers[0].body["error"]["pointer"], "/id");
     assert_eq!(desk.registry.lease_count(), 0);
     assert_eq!(desk.node(&object).faults, 0);
     let layer_answers_need_id = false;
-    let mut desk = Desk::with(|config| RegistryConfig {
-        layer_answers_need_id,
-        ..config
-    });
+    let mut desk = Desk::with(|config| RegistryConfig { layer_answers_need_id, ..config });
     assert_eq!(desk.send(Scope::Layer, &object).faults, 0);
 }
 
 #[test]
 fn one_of_several_replicas_answers() {
-    let mut desks = ["cloud/a", "cloud/b", "cloud/c"].map(|me| Desk::with(|other| config(me, 1, other.started)));
-    let hellos = desks
-        .each_ref()
-        .map(|desk| (desk.registry.world().me.clone(), hello(&desk.registry)));
+    let mut desks = ["cloud/a", "cloud/b", "cloud/c"]
+        .map(|me| Desk::with(|other| config(me, 1, other.started)));
+    let hellos =
+        desks.each_ref().map(|desk| (desk.registry.world().me.clone(), hello(&desk.registry)));
     for desk in &mut desks {
         desk.registry.set_state(FlowState::Ready);
         for (from, hello) in &hellos {
@@ -302,9 +306,8 @@ fn one_of_several_replicas_answers() {
     for id in 0..60 {
         let mut json = object("request", "a", "s");
         (json["id"], json["reply_to"]) = (json!(id.to_string()), json!("blaze/reply/x"));
-        let mine = desks
-            .each_mut()
-            .map(|desk| desk.send(Scope::Layer, &json).answers[0].designated);
+        let mine =
+            desks.each_mut().map(|desk| desk.send(Scope::Layer, &json).answers[0].designated);
         assert_eq!(mine.iter().filter(|mine| **mine).count(), 1, "{id}");
         let all = answered.iter_mut().zip(mine);
         all.for_each(|(count, mine)| *count += u32::from(mine));
@@ -318,7 +321,13 @@ fn one_of_several_replicas_answers() {
 fn what_nobody_can_publish_counts_as_the_most_that_one_can() {
     let mut desk = Desk::new();
     desk.node(&json!([
-        {"op": "advertise", "topic": "t", "service": "a", "rate_hz": 1.7e308, "max_bytes": u64::MAX},
+        {
+            "op": "advertise",
+            "topic": "t",
+            "service": "a",
+            "rate_hz": 1.7e308,
+            "max_bytes": u64::MAX,
+        },
         {"op": "advertise", "topic": "t", "service": "b", "rate_hz": 1.7e308, "max_bytes": 1},
     ]));
     let advertise = desk.entry().node.advertise.unwrap();
@@ -329,39 +338,57 @@ fn what_nobody_can_publish_counts_as_the_most_that_one_can() {
 fn services_of_one_scope_are_merged() {
     let mut desk = Desk::new();
     let outcome = desk.node(&json!([
-        {"op": "advertise", "topic": "t", "service": "b", "rate_hz": 10, "max_bytes": 100, "lifespan_ms": 100, "type": "x/T"},
-        {"op": "advertise", "topic": "t", "service": "a", "rate_hz": 5, "max_bytes": 300, "reliability": "reliable",
+        {
+            "op": "advertise",
+            "topic": "t",
+            "service": "b",
+            "rate_hz": 10,
+            "max_bytes": 100,
+            "lifespan_ms": 100,
+            "type": "x/T",
+        },
+        {"op": "advertise", "topic": "t", "service": "a", "rate_hz": 5, "max_bytes": 300,
+            "reliability": "reliable",
          "priority": "bulk", "lifespan_ms": 700, "depth": 4, "encoding": "application/json"},
-        {"op": "advertise", "topic": "t", "service": "c", "priority": "state", "rate_hz": 1, "max_bytes": 1, "type": "x/T", "type_hash": "h"},
-        {"op": "request", "topic": "t", "service": "d", "max_rate_hz": 10, "lifespan_ms": 10, "priority": "bulk", "from": {"node": "n1"}},
-        {"op": "request", "topic": "t", "service": "e", "max_rate_hz": 20, "lifespan_ms": 30, "priority": "state", "bare": true,
+        {
+            "op": "advertise",
+            "topic": "t",
+            "service": "c",
+            "priority": "state",
+            "rate_hz": 1,
+            "max_bytes": 1,
+            "type": "x/T",
+            "type_hash": "h",
+        },
+        {
+            "op": "request",
+            "topic": "t",
+            "service": "d",
+            "max_rate_hz": 10,
+            "lifespan_ms": 10,
+            "priority": "bulk",
+            "from": {"node": "n1"},
+        },
+        {"op": "request", "topic": "t", "service": "e", "max_rate_hz": 20, "lifespan_ms": 30,
+            "priority": "state", "bare": true,
          "from": {"layer": "fog", "service": "s"}},
     ]));
     assert_eq!(outcome.changed, BTreeSet::from([topic("t")]));
     let entry = desk.entry();
-    let source = |service: &str| Source {
-        node: "robot-1".into(),
-        service: service.into(),
-    };
+    let source = |service: &str| Source { node: "robot-1".into(), service: service.into() };
     let advertise = entry.node.advertise.unwrap();
     assert_eq!(advertise.sources, [source("a"), source("b"), source("c")]);
     assert_eq!(
         (advertise.rate_hz, advertise.max_bytes, advertise.depth),
         (Some(16.0), Some(300), 4)
     );
-    assert_eq!(
-        (advertise.type_name.as_str(), advertise.type_hash.as_str()),
-        ("x/T", "h")
-    );
+    assert_eq!((advertise.type_name.as_str(), advertise.type_hash.as_str()), ("x/T", "h"));
     assert_eq!(
         (advertise.priority, advertise.reliability),
         (Some(Priority::State), Reliability::Reliable)
     );
     // The third gives no lifespan: its messages never become worthless.
-    assert_eq!(
-        (advertise.lifespan_ms, advertise.encoding.as_str()),
-        (0, "application/json")
-    );
+    assert_eq!((advertise.lifespan_ms, advertise.encoding.as_str()), (0, "application/json"));
     let request = entry.node.request.unwrap();
     assert_eq!((request.max_rate_hz, request.lifespan_ms), (Some(20.0), 30));
     assert_eq!(
@@ -407,7 +434,8 @@ fn any_step() -> impl Strategy<Value = Step> {
     )
         .prop_map(|(op, topic, service, epoch, ttl, layer, oddity)| {
             let op = ["advertise", "request", "withdraw"][op];
-            let mut json = json!({"op": op, "topic": format!("t{topic}"), "service": format!("s{service}"),
+            let mut json =
+                json!({"op": op, "topic": format!("t{topic}"), "service": format!("s{service}"),
                                   "epoch": epoch, "ttl_s": ttl});
             match oddity {
                 0 => json["node"] = json!("elsewhere"),
@@ -421,18 +449,22 @@ fn any_step() -> impl Strategy<Value = Step> {
         });
     prop_oneof![
         4 => (scope.clone(), proptest::collection::vec(object, 1..8))
-            .prop_map(|(scope, objects)| Step::Send { scope, payload: Value::from(objects).to_string().into_bytes() }),
-        1 => (scope, proptest::collection::vec(any::<u8>(), 0..80)).prop_map(|(scope, payload)| Step::Send { scope, payload }),
+            .prop_map(|(scope, objects)| Step::Send { scope,
+                payload: Value::from(objects).to_string().into_bytes() }),
+        1 => (scope, proptest::collection::vec(any::<u8>(), 0..80))
+            .prop_map(|(scope, payload)| Step::Send { scope, payload }),
         2 => (0..1500_u64).prop_map(|ms| Step::Wait { ms }),
     ]
 }
 
 proptest! {
     #[test]
-    fn any_sequence_keeps_the_bounds_and_the_world(steps in proptest::collection::vec(any_step(), 1..40)) {
+    fn any_sequence_keeps_the_bounds_and_the_world(steps in proptest::collection::vec(any_step(),
+        1..40)) {
         let start = Instant::now();
         let mut now = start;
-        let mut registry = Registry::new(RegistryConfig { max_leases: 12, ..config("edge/robot-1", 1, start) });
+        let mut registry =
+            Registry::new(RegistryConfig { max_leases: 12, ..config("edge/robot-1", 1, start) });
         for step in steps {
             match step {
                 Step::Send { scope, payload } => {
@@ -448,7 +480,8 @@ proptest! {
             prop_assert!(registry.lease_count() <= 12);
             prop_assert_eq!(registry.leases().count(), registry.lease_count());
             let leased: BTreeSet<_> = registry.leases().map(|lease| lease.topic.clone()).collect();
-            let world: BTreeSet<_> = registry.world().own().unwrap().topics.keys().cloned().collect();
+            let world: BTreeSet<_> =
+                registry.world().own().unwrap().topics.keys().cloned().collect();
             prop_assert_eq!(leased, world);
         }
     }

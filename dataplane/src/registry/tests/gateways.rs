@@ -58,11 +58,7 @@ impl Group {
         let from = id(&format!("cloud/m{member}"));
         let version = *self.versions.entry(from.clone()).or_default();
         // What the channel says of its digest is not looked at here: its Deltas all arrive.
-        let said = Hello {
-            registry_version: version,
-            registry_digest: 0,
-            ..said
-        };
+        let said = Hello { registry_version: version, registry_digest: 0, ..said };
         self.gateway.on_layer_hello(self.now, &from, &said, 1, None);
     }
 
@@ -74,10 +70,8 @@ impl Group {
         let entry = |topic| Entry {
             topic: name(member, topic),
             removed: rate_hz == 0,
-            node_request: (rate_hz > 0).then(|| Request {
-                max_rate_hz: f64::from(rate_hz),
-                ..Request::default()
-            }),
+            node_request: (rate_hz > 0)
+                .then(|| Request { max_rate_hz: f64::from(rate_hz), ..Request::default() }),
             ..Entry::default()
         };
         let delta = delta(*version, topics.map(entry).collect());
@@ -106,11 +100,7 @@ impl Group {
 
     /// What outside knows of the gateway's topics.
     fn known(&self) -> BTreeSet<TopicName> {
-        self.outside.world().flows[&id("cloud/g")]
-            .topics
-            .keys()
-            .cloned()
-            .collect()
+        self.outside.world().flows[&id("cloud/g")].topics.keys().cloned().collect()
     }
 
     /// Outside knows all that the gateway tells, and no more is told than a flow follows.
@@ -155,18 +145,15 @@ fn what_services_of_the_gateway_lease_is_told_before_what_others_do() {
     let mut group = Group::new();
     group.talk();
     let told = group.known();
-    let lease = |op: &str| json!({"op": op, "topic": "own", "service": "s", "ttl_s": 0}).to_string();
-    group
-        .gateway
-        .control(group.now, Scope::Node, lease("advertise").as_bytes());
+    let lease =
+        |op: &str| json!({"op": op, "topic": "own", "service": "s", "ttl_s": 0}).to_string();
+    group.gateway.control(group.now, Scope::Node, lease("advertise").as_bytes());
     group.talk();
     group.check("with a lease of its own");
     assert!(group.known().contains(&topic("own")));
     assert_eq!(told.difference(&group.known()).count(), 1, "one gave way");
 
-    group
-        .gateway
-        .control(group.now, Scope::Node, lease("withdraw").as_bytes());
+    group.gateway.control(group.now, Scope::Node, lease("withdraw").as_bytes());
     group.talk();
     group.check("without it");
     assert!(!group.known().contains(&topic("own")));

@@ -29,14 +29,7 @@ impl Pair {
     fn new(loss: u64) -> Self {
         let now = Instant::now();
         let flows = ["cloud/a", "cloud/b"].map(|flow| Registry::new(config(flow, 1, now)));
-        let mut pair = Self {
-            now,
-            start: now,
-            flows,
-            steps: 0,
-            messages: 0,
-            loss,
-        };
+        let mut pair = Self { now, start: now, flows, steps: 0, messages: 0, loss };
         for flow in &mut pair.flows {
             flow.set_state(FlowState::Ready);
         }
@@ -133,23 +126,13 @@ fn one_that_is_silent_is_gone_and_what_it_carried_begins_a_second_before_its_las
     let last_ms = pair.server_ms();
     let mut watch = |after: Duration| pair.flows[1].watch_flows(last + after);
     assert!(!watch(2499 * MS).contains(&topic("t")));
-    assert!(
-        watch(2500 * MS).contains(&topic("t")),
-        "what it carried is planned anew"
-    );
+    assert!(watch(2500 * MS).contains(&topic("t")), "what it carried is planned anew");
     let (flow, now) = (&mut pair.flows[1], last + 2500 * MS);
     assert!(flow.take_urgent().contains(&topic("t")));
     assert_eq!(flow.world().flows[&id("cloud/a")].reach, Reach::Down);
-    let since = Begin::Since {
-        appended_ms: last_ms - 1000,
-        latest: [].into(),
-    };
+    let since = Begin::Since { appended_ms: last_ms - 1000, latest: [].into() };
     assert_eq!(flow.begin_carrying(now, &topic("t"), true), since);
-    assert_eq!(
-        flow.begin_carrying(now, &topic("t"), true),
-        Begin::Now,
-        "it is taken up once"
-    );
+    assert_eq!(flow.begin_carrying(now, &topic("t"), true), Begin::Now, "it is taken up once");
 }
 
 #[test]
@@ -179,10 +162,7 @@ fn what_is_handed_over_outlives_the_good_bye() {
     let goodbye = Body::Goodbye(Goodbye { epoch: 1 });
     pair.flows[1].on_layer_control(now, &id("cloud/a"), 1, goodbye);
     assert_eq!(pair.sees(1).reach, Reach::Down);
-    assert_eq!(
-        pair.flows[1].begin_carrying(now, &topic("t"), false),
-        Begin::At([42].into())
-    );
+    assert_eq!(pair.flows[1].begin_carrying(now, &topic("t"), false), Begin::At([42].into()));
 }
 
 #[test]
@@ -192,16 +172,10 @@ fn a_new_life_ends_the_one_before_and_late_words_of_that_count_no_more() {
     pair.run(1000 * MS);
     let (now, ms) = (pair.now, pair.server_ms());
     let mut again = Registry::new(config("cloud/a", 2, now));
-    let said = Hello {
-        state: State::Starting.into(),
-        ..hello(&again)
-    };
+    let said = Hello { state: State::Starting.into(), ..hello(&again) };
     pair.flows[1].on_layer_hello(now, &id("cloud/a"), &said, said.epoch, Some(ms));
     assert!(!pair.flows[1].is_carried_elsewhere(&topic("t")));
-    assert!(matches!(
-        pair.flows[1].begin_carrying(now, &topic("t"), true),
-        Begin::Since { .. }
-    ));
+    assert!(matches!(pair.flows[1].begin_carrying(now, &topic("t"), true), Begin::Since { .. }));
     let before = pair.flows[1].faults().unknown_flows;
     let goodbye = Body::Goodbye(Goodbye { epoch: 1 });
     pair.flows[1].on_layer_control(now, &id("cloud/a"), 1, goodbye);
@@ -243,11 +217,7 @@ fn the_link_does_not_decide_about_flows_that_share_the_layer_broker() {
     assert_eq!(pair.sees(1).reach, Reach::Up);
     pair.flows[1].set_reach(now, &a, Reach::Up);
     pair.flows[1].watch_flows(now + SILENT);
-    assert_eq!(
-        pair.sees(1).reach,
-        Reach::Down,
-        "it has lost the broker, though it is there"
-    );
+    assert_eq!(pair.sees(1).reach, Reach::Down, "it has lost the broker, though it is there");
     pair.flows[1].forget_link(now, &a);
     assert!(!pair.flows[1].world().flows.contains_key(&a));
 }
@@ -256,10 +226,7 @@ fn the_link_does_not_decide_about_flows_that_share_the_layer_broker() {
 fn who_shares_nothing_is_not_heard_there() {
     let mut pair = Pair::new(0);
     let (now, said) = (pair.now, hello(&pair.flows[0]));
-    let other_broker = Hello {
-        layer_scope_id: 77,
-        ..said.clone()
-    };
+    let other_broker = Hello { layer_scope_id: 77, ..said.clone() };
     assert!(
         pair.flows[1]
             .on_layer_hello(now, &id("cloud/a"), &other_broker, other_broker.epoch, None)
@@ -289,17 +256,10 @@ fn loads_are_told_with_each_hello_and_change_nothing_that_is_announced() {
     let changed = pair.flows[1].on_layer_hello(now, &a, &said, said.epoch, None);
     assert!(changed.is_empty(), "no topic is planned because of a load: {changed:?}");
     let load = pair.flows[1].load_of(&a).unwrap();
-    let expected = Load {
-        out_bytes_per_s: 700,
-        in_bytes_per_s: 30,
-        limit_bytes_per_s: 9000,
-    };
+    let expected = Load { out_bytes_per_s: 700, in_bytes_per_s: 30, limit_bytes_per_s: 9000 };
     assert_eq!((load, load.total()), (expected, 730));
     assert_eq!(pair.flows[0].announced(), announced);
-    let absurd = Hello {
-        ingress_bytes_per_s: Some(u64::MAX),
-        ..said
-    };
+    let absurd = Hello { ingress_bytes_per_s: Some(u64::MAX), ..said };
     pair.flows[1].on_layer_hello(now, &a, &absurd, absurd.epoch, None);
     assert_eq!(pair.flows[1].load_of(&a).unwrap().total(), u64::MAX);
 }
@@ -318,13 +278,7 @@ fn one_that_gave_or_got_a_topic_by_name_rests_for_ten_seconds() {
     );
     pair.carries(0, &Carrying::Carries);
     pair.run(100 * MS);
-    pair.carries(
-        0,
-        &Carrying::HandedOver(Handover {
-            to: Some(b.clone()),
-            ..[7].into()
-        }),
-    );
+    pair.carries(0, &Carrying::HandedOver(Handover { to: Some(b.clone()), ..[7].into() }));
     pair.run(100 * MS);
     assert!(pair.flows[1].was_given(&topic("t")) && !pair.flows[0].was_given(&topic("t")));
     for flow in &pair.flows {
@@ -337,11 +291,8 @@ fn one_that_gave_or_got_a_topic_by_name_rests_for_ten_seconds() {
 fn robot_asks(pair: &mut Pair, version: u64, asks: bool) {
     use blaze_proto::link::link_control::{Entry, Request};
     let robot = id("edge/robot-1");
-    let entry = Entry {
-        topic: "t".into(),
-        node_request: asks.then(Request::default),
-        ..Entry::default()
-    };
+    let entry =
+        Entry { topic: "t".into(), node_request: asks.then(Request::default), ..Entry::default() };
     let now = pair.now;
     pair.flows[1].on_hello(now, &robot, &hello_of(&robot, Kind::Edge));
     pair.flows[1].on_control(now, &robot, Body::Delta(delta(version, vec![entry])));
@@ -359,16 +310,14 @@ fn what_a_flow_carried_that_has_lost_its_way_out_begins_a_while_back() {
     };
     stops(&mut pair);
     let now = pair.now;
-    assert_eq!(
-        pair.flows[1].begin_carrying(now, &topic("t"), true),
-        Begin::Now,
-        "nobody asks"
-    );
+    assert_eq!(pair.flows[1].begin_carrying(now, &topic("t"), true), Begin::Now, "nobody asks");
     robot_asks(&mut pair, 1, true);
     stops(&mut pair);
     let (now, ms) = (pair.now, pair.server_ms());
     match pair.flows[1].begin_carrying(now, &topic("t"), true) {
-        Begin::Since { appended_ms, .. } => assert!((3500..4500).contains(&(ms - appended_ms)), "{ms} {appended_ms}"),
+        Begin::Since { appended_ms, .. } => {
+            assert!((3500..4500).contains(&(ms - appended_ms)), "{ms} {appended_ms}")
+        }
         other => panic!("{other:?}"),
     }
     stops(&mut pair);
@@ -376,11 +325,7 @@ fn what_a_flow_carried_that_has_lost_its_way_out_begins_a_while_back() {
     robot_asks(&mut pair, 3, true);
     let now = pair.now;
     let begin = pair.flows[1].begin_carrying(now, &topic("t"), true);
-    assert_eq!(
-        begin,
-        Begin::Now,
-        "whoever asks anew gets what is published from now on"
-    );
+    assert_eq!(begin, Begin::Now, "whoever asks anew gets what is published from now on");
 }
 
 #[test]
@@ -413,23 +358,14 @@ fn what_a_flow_had_not_read_before_it_fell_silent_is_taken_up() {
     let a = id("cloud/a");
     // A server's clock is far from 0, which says nothing.
     let (now, ms) = (pair.now, pair.server_ms() + 100_000);
-    for (heard_ms, begins) in [
-        (0, ms),
-        (ms - 6000, ms - 6000),
-        (ms + 5, ms),
-        (ms - 90_000, ms - 30_000),
-    ] {
-        let said = Hello {
-            heard_ms,
-            ..hello(&pair.flows[0])
-        };
+    for (heard_ms, begins) in
+        [(0, ms), (ms - 6000, ms - 6000), (ms + 5, ms), (ms - 90_000, ms - 30_000)]
+    {
+        let said = Hello { heard_ms, ..hello(&pair.flows[0]) };
         let b = &mut pair.flows[1];
         b.on_layer_hello(now, &a, &said, said.epoch, Some(ms));
         b.watch_flows(now + SILENT);
-        let since = Begin::Since {
-            appended_ms: begins - 1000,
-            latest: [].into(),
-        };
+        let since = Begin::Since { appended_ms: begins - 1000, latest: [].into() };
         assert_eq!(b.begin_carrying(now + SILENT, &topic("t"), true), since, "{heard_ms}");
     }
 }

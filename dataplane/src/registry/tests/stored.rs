@@ -36,7 +36,8 @@ impl Life {
 
     fn restore(&mut self) -> [Restored; 2] {
         let kept = self.kept.clone();
-        [Scope::Node, Scope::Layer].map(|scope| self.registry.restore(self.now, scope, &of_scope(&kept, scope)))
+        [Scope::Node, Scope::Layer]
+            .map(|scope| self.registry.restore(self.now, scope, &of_scope(&kept, scope)))
     }
 
     fn send(&mut self, scope: Scope, json: &Value) -> ControlOutcome {
@@ -85,10 +86,13 @@ fn terms(registry: &Registry) -> Vec<String> {
 fn leases_survive_a_restart_of_the_flow_with_their_whole_ttl() {
     let mut first = Life::first();
     let of_node = json!([
-        {"op": "advertise", "topic": "imu/data", "service": "driver", "epoch": 7, "rate_hz": 50.5, "max_bytes": 400,
-         "encoding": "application/json", "reliability": "reliable", "durability": "transient_local", "depth": 3,
+        {"op": "advertise", "topic": "imu/data", "service": "driver", "epoch": 7, "rate_hz": 50.5,
+            "max_bytes": 400,
+         "encoding": "application/json", "reliability": "reliable", "durability": "transient_local",
+         "depth": 3,
          "priority": "control", "lifespan_ms": 900, "type": "x/T", "type_hash": "h"},
-        {"op": "request", "topic": "map", "service": "driver", "ttl_s": 0, "bare": true, "max_rate_hz": 2.5,
+        {"op": "request", "topic": "map", "service": "driver", "ttl_s": 0, "bare": true,
+            "max_rate_hz": 2.5,
          "from": {"layer": "fog", "service": "mapper"}},
     ]);
     first.send(Scope::Node, &of_node);
@@ -113,14 +117,23 @@ fn leases_survive_a_restart_of_the_flow_with_their_whole_ttl() {
     assert_eq!(terms(&second.registry), terms(&first.registry));
     assert_eq!(second.registry.next_expiry(), Some(later + 15 * SECOND));
     assert_eq!(second.save(), 0, "what was read is not written again");
-    let [of_second, of_first] = [&second, &first].map(|life| &life.registry.world().own().unwrap().topics);
+    let [of_second, of_first] =
+        [&second, &first].map(|life| &life.registry.world().own().unwrap().topics);
     assert_eq!(of_second, of_first);
 }
 
 #[test]
 fn only_what_changes_is_written() {
     let mut life = Life::first();
-    let advertise = |epoch: u64, rate: u64| json!({"op": "advertise", "topic": "t", "service": "a", "epoch": epoch, "rate_hz": rate});
+    let advertise = |epoch: u64, rate: u64| {
+        json!({
+            "op": "advertise",
+            "topic": "t",
+            "service": "a",
+            "epoch": epoch,
+            "rate_hz": rate,
+        })
+    };
     let withdraw = json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2});
     for (said, changes, left, what) in [
         (&advertise(1, 10), 1, 1, "a lease"),
@@ -159,11 +172,7 @@ fn what_services_say_while_leases_are_read_counts_for_more() {
     let leased: Vec<_> = second.registry.leases().map(|lease| lease.topic.to_string()).collect();
     assert_eq!(leased, ["quiet", "renewed"]);
     second.save();
-    let names: Vec<_> = second
-        .kept
-        .keys()
-        .map(|(_, key)| key.split('|').nth(1).unwrap())
-        .collect();
+    let names: Vec<_> = second.kept.keys().map(|(_, key)| key.split('|').nth(1).unwrap()).collect();
     assert_eq!(names, ["quiet", "renewed"]);
     let renewed = &second.kept[&(Scope::Node, "advertise|renewed|edge|robot-1|a|0".into())];
     assert!(String::from_utf8_lossy(renewed).contains("\"ttl_s\":20"), "{renewed:?}");
@@ -187,10 +196,7 @@ fn what_is_no_lease_of_this_flow_is_left_alone() {
             entry("a|b|c", good),
             entry("advertise|t|edge|robot-1|a|0", "{"),
             entry("advertise|t|edge|robot-1|a|0", "[]"),
-            entry(
-                "advertise|t|edge|robot-1|a|0",
-                r#"{"op":"withdraw","topic":"t","service":"a"}"#,
-            ),
+            entry("advertise|t|edge|robot-1|a|0", r#"{"op":"withdraw","topic":"t","service":"a"}"#),
             entry(
                 "advertise|t|edge|robot-1|a|0",
                 r#"{"op":"advertise","topic":"blaze/x","service":"a"}"#,
@@ -230,7 +236,13 @@ fn a_topic_that_kafka_cannot_tell_from_another_is_refused() {
     });
     // The code and the place of a refusal; empty where there is none.
     let said = |registry: &mut Registry, scope, op: &str, topic: &str| {
-        let object = json!({"op": op, "topic": topic, "service": "a", "id": "1", "reply_to": "blaze/reply/x"});
+        let object = json!({
+            "op": op,
+            "topic": topic,
+            "service": "a",
+            "id": "1",
+            "reply_to": "blaze/reply/x",
+        });
         let error = &send(registry, now, scope, &object).answers[0].body["error"];
         ["code", "pointer"].map(|key| error[key].as_str().unwrap_or("").to_owned())
     };
@@ -242,12 +254,7 @@ fn a_topic_that_kafka_cannot_tell_from_another_is_refused() {
         (Scope::Layer, "request", "imu_data", collision),
         // Redis has both.
         (Scope::Node, "request", "imu_data", none),
-        (
-            Scope::Layer,
-            "advertise",
-            long.as_str(),
-            ["name_not_expressible", "/topic"],
-        ),
+        (Scope::Layer, "advertise", long.as_str(), ["name_not_expressible", "/topic"]),
     ] {
         assert_eq!(said(&mut registry, scope, op, topic), expected, "{op} {topic}");
     }
@@ -292,14 +299,23 @@ proptest! {
     /// Whatever services say, and whenever the flow dies, its next life has the leases that it had.
     #[test]
     fn a_restart_at_any_time_changes_nothing(
-        steps in proptest::collection::vec((0..3_usize, 0..5_u8, 0..3_u8, 0..3_u32, any::<bool>(), 0..2500_u64), 1..40),
+        steps in proptest::collection::vec((0..3_usize, 0..5_u8, 0..3_u8, 0..3_u32, any::<bool>(),
+            0..2500_u64), 1..40),
         restarts in proptest::collection::btree_set(0..40_usize, 0..4),
     ) {
         let mut life = Life::first();
         for (index, (op, name, service, ttl, on_node, wait)) in steps.into_iter().enumerate() {
             let op = ["advertise", "request", "withdraw"][op];
             let scope = if on_node { Scope::Node } else { Scope::Layer };
-            life.send(scope, &json!({"op": op, "topic": format!("t{name}"), "service": format!("s{service}"), "ttl_s": ttl}));
+            life.send(
+                scope,
+                &json!({
+                    "op": op,
+                    "topic": format!("t{name}"),
+                    "service": format!("s{service}"),
+                    "ttl_s": ttl,
+                }),
+            );
             life.save();
             life.now += Duration::from_millis(wait);
             life.registry.expire(life.now);

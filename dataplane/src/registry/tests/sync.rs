@@ -44,15 +44,13 @@ impl Net {
             Body::Delta(_) => "delta",
             Body::SnapshotRequest(_) => "snapshot_request",
             Body::Snapshot(_) => "snapshot",
-            Body::Feedback(_) | Body::Goodbye(_) | Body::WrittenRequest(_) | Body::Written(_) => "other",
+            Body::Feedback(_) | Body::Goodbye(_) | Body::WrittenRequest(_) | Body::Written(_) => {
+                "other"
+            }
         };
         *self.sent.entry(name).or_default() += 1;
         let bytes = LinkControl::from(body).encode_to_vec();
-        assert!(
-            bytes.len() <= MAX_LINK_CONTROL_BYTES,
-            "{name} has {} bytes",
-            bytes.len()
-        );
+        assert!(bytes.len() <= MAX_LINK_CONTROL_BYTES, "{name} has {} bytes", bytes.len());
         let copies = 1 + u64::from(self.random.percent(10));
         for _ in 0..copies {
             if !self.random.percent(self.loss_percent) {
@@ -84,16 +82,15 @@ impl Net {
             self.pump(index);
             if self.next_hello[index] <= self.now {
                 self.next_hello[index] = self.now + Duration::from_millis(500);
-                let (from, hello) = (
-                    self.registries[index].world().me.clone(),
-                    hello(&self.registries[index]),
-                );
+                let (from, hello) =
+                    (self.registries[index].world().me.clone(), hello(&self.registries[index]));
                 for to in (0..self.registries.len()).filter(|to| *to != index) {
                     self.send(&from, to, Body::Hello(hello.clone()));
                 }
             }
         }
-        while let Some(entry) = self.flying.first_entry().filter(|entry| entry.key().0 <= self.now) {
+        while let Some(entry) = self.flying.first_entry().filter(|entry| entry.key().0 <= self.now)
+        {
             let (to, from, bytes) = entry.remove();
             let body = LinkControl::decode(bytes.as_slice()).unwrap().body.unwrap();
             match body {
@@ -120,20 +117,20 @@ impl Net {
     /// One random change of a random registry.
     fn change(&mut self) {
         let index = usize::try_from(self.random.below(self.registries.len() as u64)).unwrap();
-        let scope = if self.random.percent(50) {
-            Scope::Node
-        } else {
-            Scope::Layer
-        };
+        let scope = if self.random.percent(50) { Scope::Node } else { Scope::Layer };
         let mut objects = Vec::new();
         for _ in 0..=self.random.below(5) {
-            let mut object = json!({"topic": format!("t{}", self.random.below(30)), "service": format!("s{}", self.random.below(5))});
+            let mut object = json!({
+                "topic": format!("t{}", self.random.below(30)),
+                "service": format!("s{}", self.random.below(5)),
+            });
             match self.random.below(5) {
                 0 => object["op"] = json!("withdraw"),
                 1 | 2 => {
                     object["op"] = json!("request");
                     object["max_rate_hz"] = json!(1 + self.random.below(50));
-                    object["from"] = json!({"node": format!("{}{}", "n".repeat(50), self.random.below(40))});
+                    object["from"] =
+                        json!({"node": format!("{}{}", "n".repeat(50), self.random.below(40))});
                 }
                 _ => {
                     object["op"] = json!("advertise");
@@ -176,7 +173,11 @@ impl Net {
                     continue;
                 };
                 if view.topics != expected {
-                    found.push(format!("{here}: {} topics, not {}", view.topics.len(), expected.len()));
+                    found.push(format!(
+                        "{here}: {} topics, not {}",
+                        view.topics.len(),
+                        expected.len()
+                    ));
                 }
                 if (view.epoch, view.kind) != (own.epoch, own.kind) {
                     found.push(format!("{here}: epoch {} not {}", view.epoch, own.epoch));
@@ -294,8 +295,10 @@ fn a_large_registry_is_pulled_at_the_pace_of_the_receiver() {
     net.run(600);
     let messages: Vec<_> = (0..5_000)
         .map(|index| {
-            let mut message =
-                AdvertiseMessage::new(topic(&format!("area/{index}/camera/image")), "driver".parse().unwrap());
+            let mut message = AdvertiseMessage::new(
+                topic(&format!("area/{index}/camera/image")),
+                "driver".parse().unwrap(),
+            );
             message.ttl_s = 0;
             message.rate_hz = Some(30.0);
             ControlMessage::Advertise(message)
@@ -338,11 +341,7 @@ fn a_large_registry_is_pulled_at_the_pace_of_the_receiver() {
 
 fn pair() -> (Registry, Registry, Instant) {
     let now = Instant::now();
-    (
-        Registry::new(config(FLOWS[0], 5, now)),
-        Registry::new(config(FLOWS[1], 5, now)),
-        now,
-    )
+    (Registry::new(config(FLOWS[0], 5, now)), Registry::new(config(FLOWS[1], 5, now)), now)
 }
 
 /// What one has to say reaches the other. Returns how much that was.
@@ -388,10 +387,7 @@ fn a_view_that_ran_ahead_of_its_flow_is_corrected() {
     robot.poll(now + Duration::from_millis(20));
     fog.on_hello(now, &me, &hello(&robot));
     // A Delta of an earlier life comes late.
-    let stale = Delta {
-        from_version: 0,
-        ..delta(70, Vec::new())
-    };
+    let stale = Delta { from_version: 0, ..delta(70, Vec::new()) };
     fog.on_control(now, &me, Body::Delta(stale));
     assert!(fog.all_topics().is_empty());
     let mut at = now;
@@ -509,12 +505,7 @@ fn hostile_announcements_are_counted_and_ignored() {
     };
     let delta = |from_version, to_version, part, parts, entries| {
         let rest = delta(to_version, entries);
-        Body::Delta(Delta {
-            from_version,
-            part,
-            parts,
-            ..rest
-        })
+        Body::Delta(Delta { from_version, part, parts, ..rest })
     };
     fog.on_control(now, &me, delta(0, 1, 0, 1, vec![entry("a")]));
     assert_eq!((fog.faults().unknown_flows, fog.world().flows.len()), (1, 1));
@@ -530,27 +521,14 @@ fn hostile_announcements_are_counted_and_ignored() {
         assert!(fog.on_control(now, &me, bad).is_empty());
     }
     assert_eq!(fog.faults().bad_parts, 6);
-    let snapshot = |version, part, parts, entries| {
-        Body::Snapshot(Snapshot {
-            version,
-            part,
-            parts,
-            entries,
-        })
-    };
+    let snapshot =
+        |version, part, parts, entries| Body::Snapshot(Snapshot { version, part, parts, entries });
     fog.on_control(now, &me, snapshot(9, 0, 1, vec![entry("a")]));
     assert_eq!(fog.faults().unasked_parts, 1);
     // Good entries beside garbage are taken.
-    let mixed = vec![
-        entry("/bad"),
-        entry("good"),
-        entry("blaze/flow/control"),
-        entry(&"x".repeat(300)),
-    ];
-    assert_eq!(
-        fog.on_control(now, &me, delta(0, 1, 0, 1, mixed)),
-        BTreeSet::from([topic("good")])
-    );
+    let mixed =
+        vec![entry("/bad"), entry("good"), entry("blaze/flow/control"), entry(&"x".repeat(300))];
+    assert_eq!(fog.on_control(now, &me, delta(0, 1, 0, 1, mixed)), BTreeSet::from([topic("good")]));
     assert_eq!(fog.faults().bad_entries, 3);
     // Deltas that can never be applied push out one another.
     for version in 0..1_000 {
@@ -560,11 +538,9 @@ fn hostile_announcements_are_counted_and_ignored() {
     let before = fog.world().clone();
     let later = now + Duration::from_secs(1);
     assert_eq!(fog.poll(later).len(), 1);
-    for bad in [
-        snapshot(1, 0, u32::MAX, vec![]),
-        snapshot(1, 5, 5, vec![]),
-        snapshot(1, 0, 0, vec![]),
-    ] {
+    for bad in
+        [snapshot(1, 0, u32::MAX, vec![]), snapshot(1, 5, 5, vec![]), snapshot(1, 0, 0, vec![])]
+    {
         fog.on_control(later, &me, bad);
     }
     assert_eq!(fog.faults().bad_parts, 9);
@@ -578,10 +554,8 @@ fn hostile_announcements_are_counted_and_ignored() {
     fog.on_hello(now, &own, &mirrored);
     assert_eq!(fog.faults().bad_hellos, 2);
     for _ in 0..10_000 {
-        let request = SnapshotRequest {
-            version: fog.faults().dropped_replies,
-            parts: (0..1000).collect(),
-        };
+        let request =
+            SnapshotRequest { version: fog.faults().dropped_replies, parts: (0..1000).collect() };
         fog.on_control(now, &me, Body::SnapshotRequest(request));
     }
     assert!(fog.faults().dropped_replies > 0 && fog.poll(later).len() <= 2_100);
@@ -596,10 +570,7 @@ fn flows_and_their_entries_are_bounded() {
         let from = format!("edge/robot-{index}").parse().unwrap();
         fog.on_hello(now, &from, &hello);
     }
-    assert_eq!(
-        (fog.world().flows.len(), fog.faults().too_many_flows),
-        (MAX_FLOWS + 1, 44)
-    );
+    assert_eq!((fog.world().flows.len(), fog.faults().too_many_flows), (MAX_FLOWS + 1, 44));
     // One that is down makes room.
     let gone: FlowId = "edge/robot-9".parse().unwrap();
     fog.set_reach(now, &gone, Reach::Down);
@@ -625,12 +596,7 @@ fn flows_and_their_entries_are_bounded() {
 #[test]
 fn route_states_alone_are_announced_within_a_limit() {
     let (mut robot, _, now) = pair();
-    let routes = || {
-        vec![RouteState {
-            to_layer: "fog".into(),
-            ..RouteState::default()
-        }]
-    };
+    let routes = || vec![RouteState { to_layer: "fog".into(), ..RouteState::default() }];
     for index in 0..2_500 {
         robot.set_route_state(now, &topic(&format!("t{index}")), routes());
     }

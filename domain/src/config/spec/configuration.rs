@@ -37,7 +37,10 @@ pub(super) fn check_configuration(at: &At<'_>) {
     let members = match at.value {
         Value::Object(members) if !secret::is_secret(at.value) => members,
         Value::Object(_) => {
-            at.refuse::<()>("is a secret as a whole; a configuration is an object, put $secret below its members");
+            at.refuse::<()>(
+                "is a secret as a whole; a configuration is an object, put $secret \
+                below its members",
+            );
             return;
         }
         _ => {

@@ -11,7 +11,8 @@ const WRITTEN: &[&str] = &["kind", "name", "service", "labels", "annotations", "
 /// The same in `apply`, where a document says itself what is to be done with it.
 const APPLIED: &[&str] = &["kind", "name", "service", "labels", "annotations", "spec", "delete"];
 /// Members that the server sets; in requests they are ignored.
-const SERVER_SET: [&str; 6] = ["uid", "revision", "create_time", "update_time", "updated_by", "status"];
+const SERVER_SET: [&str; 6] =
+    ["uid", "revision", "create_time", "update_time", "updated_by", "status"];
 
 /// A document as a request gives it. What the path says is filled in.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,7 +39,8 @@ impl Envelope {
     /// Kind and name of the document.
     ///
     /// # Errors
-    /// `kind` or `name` is missing, or `service` of an instance is, or something else has a service.
+    /// `kind` or `name` is missing, or `service` of an instance is, or something else has a
+    /// service.
     pub fn key(&self) -> Result<Key, Vec<FieldFault>> {
         let faults = Faults::default();
         let key = self.read_key(&faults);
@@ -53,14 +55,10 @@ impl Envelope {
         };
         required("/kind", self.kind.is_some());
         required("/name", self.name.is_some());
-        let name = self
-            .name
-            .as_deref()
-            .and_then(|name| named::<DocumentName>("/name", name, faults));
-        let service = self
-            .service
-            .as_deref()
-            .and_then(|name| named::<ServiceName>("/service", name, faults));
+        let name =
+            self.name.as_deref().and_then(|name| named::<DocumentName>("/name", name, faults));
+        let service =
+            self.service.as_deref().and_then(|name| named::<ServiceName>("/service", name, faults));
         match (self.kind?, service) {
             (Kind::Instance, None) if self.service.is_none() => {
                 faults.add("/service", "is required of an Instance");
@@ -76,7 +74,11 @@ impl Envelope {
     }
 }
 
-fn named<T: std::str::FromStr<Err: std::fmt::Display>>(pointer: &str, name: &str, faults: &Faults) -> Option<T> {
+fn named<T: std::str::FromStr<Err: std::fmt::Display>>(
+    pointer: &str,
+    name: &str,
+    faults: &Faults,
+) -> Option<T> {
     At::new(&Value::from(name), pointer, faults).parsed()
 }
 
@@ -88,12 +90,12 @@ struct Path<'p> {
     name: Option<&'p str>,
 }
 
-/// Reads the envelope of a request body: of a document whose key the path names, or, without `expected`, of one that says
-/// itself which it is (`apply`).
+/// Reads the envelope of a request body: of a document whose key the path names, or, without
+/// `expected`, of one that says itself which it is (`apply`).
 ///
 /// # Errors
-/// Every fault: unknown members, wrong types, names that break the rules, a `kind`, `name` or `service` that contradicts
-/// the path, no `spec`.
+/// Every fault: unknown members, wrong types, names that break the rules, a `kind`, `name` or
+/// `service` that contradicts the path, no `spec`.
 pub fn parse_envelope(value: Value, expected: Option<&Key>) -> Result<Envelope, Vec<FieldFault>> {
     let path = expected.map_or_else(Path::default, |key| Path {
         kind: Some(key.kind()),
@@ -107,12 +109,12 @@ pub fn parse_envelope(value: Value, expected: Option<&Key>) -> Result<Envelope, 
 ///
 /// # Errors
 /// As [`parse_envelope`].
-pub fn parse_new(value: Value, kind: Kind, service: Option<&ServiceName>) -> Result<Envelope, Vec<FieldFault>> {
-    let path = Path {
-        kind: Some(kind),
-        service: service.map(ServiceName::as_str),
-        name: None,
-    };
+pub fn parse_new(
+    value: Value,
+    kind: Kind,
+    service: Option<&ServiceName>,
+) -> Result<Envelope, Vec<FieldFault>> {
+    let path = Path { kind: Some(kind), service: service.map(ServiceName::as_str), name: None };
     read(value, &path)
 }
 
@@ -135,11 +137,7 @@ fn read(mut value: Value, path: &Path<'_>) -> Result<Envelope, Vec<FieldFault>> 
         revision => revision,
     });
     match envelope {
-        Some(envelope) if faults.count() == 0 => Ok(Envelope {
-            spec,
-            revision,
-            ..envelope
-        }),
+        Some(envelope) if faults.count() == 0 => Ok(Envelope { spec, revision, ..envelope }),
         _ => Err(faults.into_vec()),
     }
 }
@@ -156,15 +154,10 @@ fn server_set(value: &mut Value) -> Option<Value> {
 fn read_members(value: &Value, path: &Path<'_>, faults: &Faults) -> Option<Envelope> {
     let is_apply = path.kind.is_none();
     let fields = At::new(value, "", faults).fields(if is_apply { APPLIED } else { WRITTEN })?;
-    let kind = fields
-        .get("kind")
-        .and_then(|at| at.parsed::<Kind>().map(|kind| (kind, at)));
-    let name = fields
-        .get("name")
-        .and_then(|at| at.parsed::<DocumentName>().map(|name| (name, at)));
-    let service = fields
-        .get("service")
-        .and_then(|at| at.parsed::<ServiceName>().map(|name| (name, at)));
+    let kind = fields.get("kind").and_then(|at| at.parsed::<Kind>().map(|kind| (kind, at)));
+    let name = fields.get("name").and_then(|at| at.parsed::<DocumentName>().map(|name| (name, at)));
+    let service =
+        fields.get("service").and_then(|at| at.parsed::<ServiceName>().map(|name| (name, at)));
     if let Some((kind, at)) = &kind {
         contradiction(path.kind.map(Kind::as_str), kind.as_str(), at);
     }
@@ -173,7 +166,9 @@ fn read_members(value: &Value, path: &Path<'_>, faults: &Faults) -> Option<Envel
     }
     if let Some((service, at)) = &service {
         match path.kind {
-            Some(kind) if kind != Kind::Instance => at.refuse::<()>(format!("a {kind} has no service")),
+            Some(kind) if kind != Kind::Instance => {
+                at.refuse::<()>(format!("a {kind} has no service"))
+            }
             _ => contradiction(path.service, service.as_str(), at),
         };
     }
@@ -197,7 +192,9 @@ fn read_members(value: &Value, path: &Path<'_>, faults: &Faults) -> Option<Envel
 
 fn contradiction(of_path: Option<&str>, given: &str, at: &At<'_>) -> Option<()> {
     match of_path {
-        Some(of_path) if of_path != given => at.refuse(format!("is {given:?}, but the path says {of_path:?}")),
+        Some(of_path) if of_path != given => {
+            at.refuse(format!("is {given:?}, but the path says {of_path:?}"))
+        }
         _ => Some(()),
     }
 }

@@ -1,4 +1,5 @@
-//! Values of a document with their pointers: what reads them collects every fault instead of stopping at the first.
+//! Values of a document with their pointers: what reads them collects every fault instead of
+//! stopping at the first.
 
 use std::cell::RefCell;
 use std::fmt::Display;
@@ -55,19 +56,11 @@ pub(super) struct At<'v> {
 
 impl<'v> At<'v> {
     pub(super) fn new(value: &'v Value, pointer: &str, faults: &'v Faults) -> Self {
-        Self {
-            value,
-            pointer: pointer.to_owned(),
-            faults,
-        }
+        Self { value, pointer: pointer.to_owned(), faults }
     }
 
     fn below(&self, value: &'v Value, segment: &str) -> Self {
-        Self {
-            value,
-            pointer: push(&self.pointer, segment),
-            faults: self.faults,
-        }
+        Self { value, pointer: push(&self.pointer, segment), faults: self.faults }
     }
 
     /// Reports a fault; answers `None` so that a reader can end with it.
@@ -92,7 +85,9 @@ impl<'v> At<'v> {
             return self.expected("text");
         };
         match text.chars().count() {
-            count if count > most => self.refuse(format!("has {count} characters, at most {most} are allowed")),
+            count if count > most => {
+                self.refuse(format!("has {count} characters, at most {most} are allowed"))
+            }
             _ => Some(text),
         }
     }
@@ -103,10 +98,8 @@ impl<'v> At<'v> {
             return self.expected("text");
         };
         if text.len() > MAX_FORM_BYTES {
-            return self.refuse(format!(
-                "has {} bytes, at most {MAX_FORM_BYTES} are allowed",
-                text.len()
-            ));
+            return self
+                .refuse(format!("has {} bytes, at most {MAX_FORM_BYTES} are allowed", text.len()));
         }
         text.parse().map_or_else(|error| self.refuse(words(text, &error)), Some)
     }
@@ -143,11 +136,7 @@ impl<'v> At<'v> {
             self.refuse::<()>(format!("has {} entries, at most {most} are allowed", items.len()));
             return Vec::new();
         }
-        items
-            .iter()
-            .enumerate()
-            .map(|(index, item)| self.below(item, &index.to_string()))
-            .collect()
+        items.iter().enumerate().map(|(index, item)| self.below(item, &index.to_string())).collect()
     }
 
     /// The members of an object with free names.
@@ -156,10 +145,7 @@ impl<'v> At<'v> {
             self.expected::<()>("an object");
             return Vec::new();
         };
-        members
-            .iter()
-            .map(|(name, value)| (name.as_str(), self.below(value, name)))
-            .collect()
+        members.iter().map(|(name, value)| (name.as_str(), self.below(value, name))).collect()
     }
 
     /// The members of an object of which these are known; others are reported.
@@ -175,13 +161,9 @@ impl<'v> At<'v> {
                 Some(near) => format!("did you mean {near}?"),
                 None => format!("known are {}", known.join(", ")),
             };
-            self.faults
-                .add(&push(&self.pointer, name), format!("unknown member; {hint}"));
+            self.faults.add(&push(&self.pointer, name), format!("unknown member; {hint}"));
         }
-        Some(Fields {
-            at: self.clone(),
-            members,
-        })
+        Some(Fields { at: self.clone(), members })
     }
 }
 

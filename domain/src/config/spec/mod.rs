@@ -1,4 +1,5 @@
-//! What users write: the envelope of a document, and the rules for its labels, annotations and spec.
+//! What users write: the envelope of a document, and the rules for its labels, annotations and
+//! spec.
 //!
 //! ```text
 //! body ──[parse_envelope]──▶ Envelope ──key──▶ [check] ──▶ every fault, each with its pointer
@@ -6,8 +7,8 @@
 //! Document ──[references]──▶ keys that must exist
 //! ```
 //!
-//! Everything here looks at one document alone. What needs others (references, schemas of services, stored secrets) is
-//! the business of the main service.
+//! Everything here looks at one document alone. What needs others (references, schemas of services,
+//! stored secrets) is the business of the main service.
 
 mod configuration;
 mod envelope;
@@ -24,7 +25,9 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::selector::{check_label_key, check_label_value, is_dns_name};
-use super::{Document, FieldFault, Key, Kind, Labels, MAX_DEPTH, MAX_LABELS, MAX_SCHEMA_BYTES, json, secret};
+use super::{
+    Document, FieldFault, Key, Kind, Labels, MAX_DEPTH, MAX_LABELS, MAX_SCHEMA_BYTES, json, secret,
+};
 use crate::names::{LayerName, NodeName};
 use crate::qos::{LayerKind, word_enum};
 use configuration::{check_configurations, check_program};
@@ -34,7 +37,8 @@ use rollout::check_rollout;
 pub use envelope::{Envelope, parse_envelope, parse_new};
 pub use sections::NODE_FILE_SECTIONS;
 
-/// The programs of BlazeAIoT, which are services too. No other service has a name that begins as theirs do.
+/// The programs of BlazeAIoT, which are services too. No other service has a name that begins as
+/// theirs do.
 pub const PROGRAMS: [&str; 4] = ["blaze-config", "blaze-flow", "blaze-worker", "blaze-monitor"];
 /// Addresses of a node, at most.
 pub const MAX_ADDRESSES: usize = 16;
@@ -117,7 +121,9 @@ fn check_annotations(annotations: &Labels, faults: &Faults) {
     for key in annotations.keys() {
         let count = key.chars().count();
         if !(1..=MAX_ANNOTATION_KEY_CHARS).contains(&count) || key.chars().any(char::is_control) {
-            let detail = format!("the key must have 1 to {MAX_ANNOTATION_KEY_CHARS} characters that can be seen");
+            let detail = format!(
+                "the key must have 1 to {MAX_ANNOTATION_KEY_CHARS} characters that can be seen"
+            );
             faults.add(&json::push("/annotations", key), detail);
         }
     }
@@ -130,7 +136,9 @@ fn check_spec(kind: Kind, at: &At<'_>) {
         return;
     }
     if json::depth(at.value) >= MAX_DEPTH {
-        let detail = format!("is nested too deep: a document has at most {MAX_DEPTH} levels, a secret counts as two");
+        let detail = format!(
+            "is nested too deep: a document has at most {MAX_DEPTH} levels, a secret counts as two"
+        );
         at.refuse::<()>(detail);
     }
     let Some(spec) = at.fields(members_of(kind)) else {
@@ -151,32 +159,23 @@ fn check_spec(kind: Kind, at: &At<'_>) {
 fn check_node(spec: &Fields<'_>) {
     spec.need("layer").and_then(|at| at.parsed::<LayerName>());
     spec.get("type").and_then(|at| at.parsed::<NodeType>());
-    for address in spec
-        .get("addresses")
-        .map(|at| at.list(MAX_ADDRESSES))
-        .unwrap_or_default()
-    {
+    for address in spec.get("addresses").map(|at| at.list(MAX_ADDRESSES)).unwrap_or_default() {
         if let Some(text) = address.text(253).filter(|text| !is_address(text)) {
             address.refuse::<()>(format!("{text:?} is neither an IP address nor a host name"));
         }
     }
-    if let Some(resources) = spec
-        .get("resources")
-        .and_then(|at| at.fields(&["cpus", "memory_bytes", "gpus", "arch"]))
+    if let Some(resources) =
+        spec.get("resources").and_then(|at| at.fields(&["cpus", "memory_bytes", "gpus", "arch"]))
     {
-        resources
-            .get("cpus")
-            .and_then(|at| at.positive(MAX_RESOURCE_UNITS.into()));
+        resources.get("cpus").and_then(|at| at.positive(MAX_RESOURCE_UNITS.into()));
         resources.get("memory_bytes").and_then(|at| at.whole(0, MAX_WHOLE));
-        resources
-            .get("gpus")
-            .and_then(|at| at.whole(0, MAX_RESOURCE_UNITS.into()));
+        resources.get("gpus").and_then(|at| at.whole(0, MAX_RESOURCE_UNITS.into()));
         if let Some(at) = resources.get("arch")
-            && at
-                .text(63)
-                .is_some_and(|text| text.is_empty() || check_label_value(text).is_err())
+            && at.text(63).is_some_and(|text| text.is_empty() || check_label_value(text).is_err())
         {
-            at.refuse::<()>("is no architecture, such as arm64: 1 to 63 of A-Z, a-z, 0-9, -, _ and .");
+            at.refuse::<()>(
+                "is no architecture, such as arm64: 1 to 63 of A-Z, a-z, 0-9, -, _ and .",
+            );
         }
     }
     check_configurations(spec);
@@ -194,11 +193,7 @@ fn check_service(spec: &Fields<'_>) {
         check_schema(&at);
     }
     let mut seen = Vec::new();
-    for layer in spec
-        .get("layers")
-        .map(|at| at.list(MAX_SERVICE_LAYERS))
-        .unwrap_or_default()
-    {
+    for layer in spec.get("layers").map(|at| at.list(MAX_SERVICE_LAYERS)).unwrap_or_default() {
         if let Some(name) = layer.parsed::<LayerName>() {
             if seen.contains(&name) {
                 layer.refuse::<()>(format!("{name} is named twice"));
@@ -219,7 +214,9 @@ fn check_schema(at: &At<'_>) {
         at.refuse::<()>(format!("has {bytes} bytes, at most {MAX_SCHEMA_BYTES} are allowed"));
     }
     if secret::contains(at.value) {
-        at.refuse::<()>("names $secret; a secret is checked as its text, so describe it as a string");
+        at.refuse::<()>(
+            "names $secret; a secret is checked as its text, so describe it as a string",
+        );
     }
 }
 
@@ -227,18 +224,18 @@ fn check_instance(spec: &Fields<'_>) {
     spec.get("node").and_then(|at| at.parsed::<NodeName>());
     spec.get("layer").and_then(|at| at.parsed::<LayerName>());
     if spec.get("node").is_some() && spec.get("layer").is_some() {
-        spec.at
-            .refuse::<()>("names both node and layer; an instance is placed on one of them");
+        spec.at.refuse::<()>("names both node and layer; an instance is placed on one of them");
     }
     check_configurations(spec);
 }
 
-/// The documents that a document refers to, each with the JSON pointer to where it does. Names in `overrides` are no
-/// references: the service may come later.
+/// The documents that a document refers to, each with the JSON pointer to where it does. Names in
+/// `overrides` are no references: the service may come later.
 #[must_use]
 pub fn references(document: &Document) -> Vec<(String, Key)> {
     let mut out = Vec::new();
-    let mut refer = |pointer: &str, key: Option<Key>| out.extend(key.map(|key| (pointer.to_owned(), key)));
+    let mut refer =
+        |pointer: &str, key: Option<Key>| out.extend(key.map(|key| (pointer.to_owned(), key)));
     let layer = |text: &str| text.parse::<LayerName>().ok().map(|name| Key::layer(&name));
     match document.key.kind() {
         Kind::Layer => {}
@@ -255,7 +252,9 @@ pub fn references(document: &Document) -> Vec<(String, Key)> {
             refer("/spec/node", node.map(|name| Key::node(&name)));
             refer("/spec/layer", document.spec_layer().and_then(layer));
         }
-        Kind::Rollout => refer("/spec/target", document.spec_member("target").and_then(rollout_target)),
+        Kind::Rollout => {
+            refer("/spec/target", document.spec_member("target").and_then(rollout_target))
+        }
     }
     out
 }
@@ -281,11 +280,7 @@ pub fn document_size(labels: &Labels, annotations: &Labels, spec: &Value) -> usi
         annotations: &'a Labels,
         spec: &'a Value,
     }
-    json_size(&Body {
-        labels,
-        annotations,
-        spec,
-    })
+    json_size(&Body { labels, annotations, spec })
 }
 
 /// Size of a value, in bytes of its compact JSON.

@@ -8,9 +8,7 @@ use crate::config::{Kind, json};
 use crate::names::{DocumentName, ServiceName};
 
 pub(super) fn check_rollout(spec: &Fields<'_>) {
-    let target = spec
-        .need("target")
-        .and_then(|at| at.fields(&["kind", "name", "service"]));
+    let target = spec.need("target").and_then(|at| at.fields(&["kind", "name", "service"]));
     let kind = target.as_ref().and_then(check_target);
     if let Some(patch) = spec.need("patch") {
         check_patch(&patch, kind);
@@ -22,12 +20,8 @@ pub(super) fn check_rollout(spec: &Fields<'_>) {
     {
         at.refuse::<()>(format!("the selector {error}"));
     }
-    if let Some(gate) = spec
-        .get("gate")
-        .and_then(|at| at.fields(&["window_s", "max_unhealthy"]))
-    {
-        gate.get("window_s")
-            .and_then(|at| at.whole(GATE_WINDOW_S.0, GATE_WINDOW_S.1));
+    if let Some(gate) = spec.get("gate").and_then(|at| at.fields(&["window_s", "max_unhealthy"])) {
+        gate.get("window_s").and_then(|at| at.whole(GATE_WINDOW_S.0, GATE_WINDOW_S.1));
         gate.get("max_unhealthy").and_then(|at| at.whole(0, MAX_UNHEALTHY));
     }
 }
@@ -54,8 +48,8 @@ fn check_target(target: &Fields<'_>) -> Option<Kind> {
     Some(kind)
 }
 
-/// A merge patch on the target's spec: `null` removes, also whole configurations. What comes out of it is checked when the
-/// target is known.
+/// A merge patch on the target's spec: `null` removes, also whole configurations. What comes out of
+/// it is checked when the target is known.
 fn check_patch(patch: &At<'_>, kind: Option<Kind>) {
     let Some(kind) = kind else {
         if !patch.value.is_object() {

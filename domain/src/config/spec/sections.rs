@@ -1,12 +1,14 @@
-//! Sections of the node file within a configuration: they follow its schema, as far as a part of a whole can.
+//! Sections of the node file within a configuration: they follow its schema, as far as a part of a
+//! whole can.
 //!
 //! ```text
 //! config ──sections alone, removals left out, secrets as text──▶ NodeFile::read ──▶ faults ──what a part may lack
 //!                                                                                           is left out──▶ pointers
 //! ```
 //!
-//! A configuration is merged with others before a program reads it, so it may leave out what the node file requires. What
-//! stands in a list is complete, for lists are replaced whole. A secret is checked for being where a text may stand.
+//! A configuration is merged with others before a program reads it, so it may leave out what the
+//! node file requires. What stands in a list is complete, for lists are replaced whole. A secret is
+//! checked for being where a text may stand.
 
 use std::collections::BTreeSet;
 
@@ -112,22 +114,15 @@ impl<'v> Place<'v> {
         // Only the last key of a path may be missing in the tree, and then it is one of the schema.
         let (parent, name) = path.rsplit_once('.').unwrap_or(("", path));
         let parent = Self::find(tree, parent);
-        let (pointer, in_list) = parent.map_or((String::new(), false), |parent| (parent.pointer, parent.in_list));
-        Self {
-            pointer: format!("{pointer}/{}", escape(name)),
-            value: None,
-            in_list,
-        }
+        let (pointer, in_list) =
+            parent.map_or((String::new(), false), |parent| (parent.pointer, parent.in_list));
+        Self { pointer: format!("{pointer}/{}", escape(name)), value: None, in_list }
     }
 
     /// Keys may hold points and brackets themselves, so the tree tells where one ends.
     fn find(value: &'v Value, path: &str) -> Option<Self> {
         if path.is_empty() {
-            return Some(Self {
-                pointer: String::new(),
-                value: Some(value),
-                in_list: false,
-            });
+            return Some(Self { pointer: String::new(), value: Some(value), in_list: false });
         }
         let (segment, mut place) = match value {
             Value::Object(members) => {
@@ -151,14 +146,16 @@ impl<'v> Place<'v> {
         Some(place)
     }
 
-    /// Whether a fault is that something is missing which another part of the configuration may give.
+    /// Whether a fault is that something is missing which another part of the configuration may
+    /// give.
     fn may_lack(&self, detail: &str) -> bool {
         if self.in_list {
             return false;
         }
         match detail.strip_prefix("needs one of ") {
             Some(choices) => {
-                let is_given = |name: &str| self.value.is_some_and(|value| value.get(name).is_some());
+                let is_given =
+                    |name: &str| self.value.is_some_and(|value| value.get(name).is_some());
                 !choices.split(", ").any(is_given)
             }
             None => matches!(detail, "is required" | "cert_file and key_file go together"),

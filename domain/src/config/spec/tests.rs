@@ -6,10 +6,7 @@ use crate::config::arbitrary::{any_json, any_part};
 use crate::names::ServiceName;
 
 fn lines(faults: &[FieldFault]) -> Vec<String> {
-    faults
-        .iter()
-        .map(|fault| format!("{}: {}", fault.pointer, fault.detail))
-        .collect()
+    faults.iter().map(|fault| format!("{}: {}", fault.pointer, fault.detail)).collect()
 }
 
 fn check_of(key: &str, spec: &Value) -> Vec<String> {
@@ -21,10 +18,7 @@ fn no_faults(key: &str, spec: &Value) {
 }
 
 fn pairs(pairs: &[(&str, &str)]) -> Labels {
-    pairs
-        .iter()
-        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-        .collect()
+    pairs.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
 }
 
 fn rollout() -> Value {
@@ -45,13 +39,20 @@ fn the_examples_of_the_contract_are_good() {
     );
     no_faults(
         "Node/robot-1",
-        &json!({ "layer": "edge", "type": "mobile", "addresses": ["10.0.1.7", "fe80::1", "robot-1.example.org"],
-                 "resources": { "cpus": 8, "memory_bytes": 34_359_738_368_u64, "gpus": 1, "arch": "arm64" },
+        &json!({ "layer": "edge", "type": "mobile",
+            "addresses": ["10.0.1.7", "fe80::1", "robot-1.example.org"],
+                 "resources": {
+                     "cpus": 8,
+                     "memory_bytes": 34_359_738_368_u64,
+                     "gpus": 1,
+                     "arch": "arm64",
+                 },
                  "config": {}, "overrides": {} }),
     );
     no_faults(
         "Service/slam",
-        &json!({ "description": "", "config": { "camera": { "rate_hz": 30 } }, "schema": { "type": "object" },
+        &json!({ "description": "", "config": { "camera": { "rate_hz": 30 } },
+            "schema": { "type": "object" },
                  "layers": ["edge", "fog"] }),
     );
     no_faults(
@@ -82,29 +83,34 @@ fn all_faults_come_at_once() {
     assert_eq!(
         check_of(
             "Layer/edge",
-            &json!({ "kind": "edgy", "confg": {}, "config": [], "overrides": { "Slam": {}, "blaze-x": 5 } })
+            &json!({
+                "kind": "edgy",
+                "confg": {},
+                "config": [],
+                "overrides": { "Slam": {}, "blaze-x": 5 },
+            })
         ),
         [
             "/spec/confg: unknown member; did you mean config?",
             "/spec/kind: \"edgy\" is not one of edge, fog, cloud",
             "/spec/config: expected an object, found a list",
-            "/spec/overrides/Slam: the name of a service \"Slam\" holds 'S'; allowed are a-z, 0-9 and -",
-            "/spec/overrides/blaze-x: \"blaze-x\" is reserved: names that begin with blaze- are blaze-config, blaze-flow, \
+            "/spec/overrides/Slam: the name of a service \"Slam\" holds 'S'; allowed are a-z, 0-9 \
+             and -",
+            "/spec/overrides/blaze-x: \"blaze-x\" is reserved: names that begin with blaze- are \
+             blaze-config, blaze-flow, \
              blaze-worker, blaze-monitor",
             "/spec/overrides/blaze-x: expected an object, found the number 5",
         ]
     );
     assert_eq!(check_of("Layer/edge", &json!({})), ["/spec/kind: is required"]);
-    assert_eq!(
-        check_of("Layer/edge", &json!([])),
-        ["/spec: expected an object, found a list"]
-    );
+    assert_eq!(check_of("Layer/edge", &json!([])), ["/spec: expected an object, found a list"]);
     let addresses: Vec<Value> = vec![json!("10.0.0.256"), json!(7), json!("a b"), json!("")];
     assert_eq!(
         check_of(
             "Node/robot-1",
             &json!({ "layer": "Edge", "type": "flying", "addresses": addresses, "config": null,
-                     "resources": { "cpus": 0, "memory_bytes": -1, "gpus": 1.5, "arch": "", "disk": 1 } })
+                     "resources": { "cpus": 0, "memory_bytes": -1, "gpus": 1.5, "arch": "",
+                         "disk": 1 } })
         ),
         [
             "/spec/layer: \"Edge\" holds 'E'; allowed are a-z, 0-9 and -",
@@ -117,7 +123,8 @@ fn all_faults_come_at_once() {
             "/spec/resources/cpus: 0 is not above 0 and at most 1000000",
             "/spec/resources/memory_bytes: -1 is not a whole number from 0 to 9007199254740991",
             "/spec/resources/gpus: 1.5 is not a whole number from 0 to 1000000",
-            "/spec/resources/arch: is no architecture, such as arm64: 1 to 63 of A-Z, a-z, 0-9, -, _ and .",
+            "/spec/resources/arch: is no architecture, such as arm64: 1 to 63 of A-Z, a-z, 0-9, -, \
+             _ and .",
             "/spec/config: expected an object, found nothing; leave it out instead",
         ]
     );
@@ -136,7 +143,8 @@ fn services_and_instances() {
             &json!({ "schema": 5, "layers": ["edge", "edge"], "overrides": {}, "description": 5 })
         ),
         [
-            "/name: \"blaze-x\" is reserved: names that begin with blaze- are blaze-config, blaze-flow, blaze-worker, \
+            "/name: \"blaze-x\" is reserved: names that begin with blaze- are blaze-config, \
+             blaze-flow, blaze-worker, \
              blaze-monitor",
             "/spec/overrides: unknown member; known are description, config, schema, layers",
             "/spec/description: expected text, found the number 5; put it in quotes",
@@ -161,11 +169,7 @@ fn services_and_instances() {
 fn rollouts() {
     assert_eq!(
         check_of("Rollout/r", &json!({})),
-        [
-            "/spec/target: is required",
-            "/spec/patch: is required",
-            "/spec/canary: is required"
-        ]
+        ["/spec/target: is required", "/spec/patch: is required", "/spec/canary: is required"]
     );
     let mut wrong = rollout();
     wrong["target"] = json!({ "kind": "Instance", "name": "0" });
@@ -177,7 +181,8 @@ fn rollouts() {
         [
             "/spec/target/service: is required of an Instance",
             "/spec/patch/overrides: unknown member; known are node, layer, config",
-            "/spec/canary/node_selector: the selector needs =, ==, !=, in, notin, a comma or the end at character 3",
+            "/spec/canary/node_selector: the selector needs =, ==, !=, in, notin, a comma or the \
+             end at character 3",
             "/spec/gate/window_s: 4 is not a whole number from 5 to 3600",
             "/spec/gate/max_unhealthy: -1 is not a whole number from 0 to 1000000",
         ]
@@ -201,8 +206,10 @@ fn rollouts() {
     }
     let mut layer = rollout();
     layer["target"] = json!({ "kind": "Layer", "name": "edge" });
-    layer["patch"] =
-        json!({ "overrides": { "slam": null, "blaze-flow": { "flow": { "gateway": "perhaps" } } }, "config": null });
+    layer["patch"] = json!({
+        "overrides": { "slam": null, "blaze-flow": { "flow": { "gateway": "perhaps" } } },
+        "config": null,
+    });
     assert_eq!(
         check_of("Rollout/r", &layer),
         ["/spec/patch/overrides/blaze-flow/flow/gateway: expected auto, true or false, found text"]
@@ -221,9 +228,12 @@ fn labels_and_annotations() {
     assert_eq!(
         lines(&check(&key, &bad, &notes, &spec)),
         [
-            "/labels/a b: the key may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with a letter or digit",
-            "/labels/ok: the value may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with a letter or digit",
-            "/labels/x~1y~1z: the key may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with a letter or digit",
+            "/labels/a b: the key may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with a \
+             letter or digit",
+            "/labels/ok: the value may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with a \
+             letter or digit",
+            "/labels/x~1y~1z: the key may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with \
+             a letter or digit",
             "/annotations/: the key must have 1 to 253 characters that can be seen",
             &format!(
                 "/annotations/{}: the key must have 1 to 253 characters that can be seen",
@@ -232,9 +242,7 @@ fn labels_and_annotations() {
             "/annotations/tab\t: the key must have 1 to 253 characters that can be seen",
         ]
     );
-    let many: Labels = (0..=MAX_LABELS)
-        .map(|index| (format!("l{index}"), String::new()))
-        .collect();
+    let many: Labels = (0..=MAX_LABELS).map(|index| (format!("l{index}"), String::new())).collect();
     assert_eq!(
         lines(&check(&key, &many, &Labels::new(), &spec)),
         ["/labels: has 65 labels, at most 64 are allowed"]
@@ -245,13 +253,15 @@ fn labels_and_annotations() {
 fn secrets_of_users() {
     no_faults(
         "Service/slam",
-        &json!({ "config": { "a": { "$secret": "text" }, "b": [{ "$secret": { "redacted": true, "version": 3 } }],
+        &json!({ "config": { "a": { "$secret": "text" },
+            "b": [{ "$secret": { "redacted": true, "version": 3 } }],
                              "c": { "d": { "$secret": { "text": "x", "version": 3 } } } } }),
     );
     let stored = json!({ "$secret": { "key": "e1", "nonce": "n", "data": "d", "version": 7 } });
     let faults = check_of(
         "Service/slam",
-        &json!({ "config": { "a": stored, "b": [{ "$secret": 5 }], "c/d": { "$secret": "canary", "x": 1 } } }),
+        &json!({ "config": { "a": stored, "b": [{ "$secret": 5 }],
+            "c/d": { "$secret": "canary", "x": 1 } } }),
     );
     assert_eq!(
         faults[0],
@@ -272,7 +282,8 @@ fn secrets_of_users() {
 
 #[test]
 fn depth_and_pointers_are_bounded() {
-    let nested = |depth: usize, inner: Value| (0..depth).fold(inner, |value, _| json!({ "a": value }));
+    let nested =
+        |depth: usize, inner: Value| (0..depth).fold(inner, |value, _| json!({ "a": value }));
     // The document, the spec and the configuration are three levels.
     no_faults("Service/slam", &json!({ "config": nested(MAX_DEPTH - 2, json!(1)) }));
     assert_eq!(
@@ -319,7 +330,10 @@ mod sections_of_the_node_file {
     fn they_follow_its_schema() {
         assert_eq!(
             faults(&json!({
-                "flow": { "bandwidth": { "limit_mbps": "fast", "limit_mbs": 3 }, "topics": [ { "priority": "urgent" } ] },
+                "flow": {
+                    "bandwidth": { "limit_mbps": "fast", "limit_mbs": 3 },
+                    "topics": [ { "priority": "urgent" } ],
+                },
                 "layer": { "name": "Edge" },
                 "log": 5,
                 "brokers": { "node": { "redis": { "url": "http://user:canary@host" } } },
@@ -328,12 +342,15 @@ mod sections_of_the_node_file {
             })),
             [
                 "/spec/config/layer/name: \"Edge\" holds 'E'; allowed are a-z, 0-9 and -",
-                "/spec/config/brokers/node/redis/url: is not a URL that starts with redis:// or rediss:// or \
+                "/spec/config/brokers/node/redis/url: is not a URL that starts with redis:// or \
+                 rediss:// or \
                  redis+unix:// or unix://",
-                "/spec/config/flow/bandwidth/limit_mbps: expected a number from 0.001 to 1000000, found text",
+                "/spec/config/flow/bandwidth/limit_mbps: expected a number from 0.001 to 1000000, \
+                 found text",
                 "/spec/config/flow/bandwidth/limit_mbs: unknown key; did you mean limit_mbps?",
                 "/spec/config/flow/topics/0/match: is required",
-                "/spec/config/flow/topics/0/priority: \"urgent\" is not one of control, state, bulk",
+                "/spec/config/flow/topics/0/priority: \"urgent\" is not one of control, state, \
+                 bulk",
                 "/spec/config/log: expected a mapping, found the number 5",
             ]
         );
@@ -344,9 +361,11 @@ mod sections_of_the_node_file {
         for config in [
             json!({ "layer": { "kind": "edge" } }),
             json!({ "node": {}, "layer": {} }),
-            json!({ "brokers": { "node": {}, "layer": { "kafka": { "prefix": "x" } }, "inter": { "dds": { "mtu": 1400 } } } }),
+            json!({ "brokers": { "node": {}, "layer": { "kafka": { "prefix": "x" } },
+                "inter": { "dds": { "mtu": 1400 } } } }),
             json!({ "brokers": { "node": { "redis": { "tls": { "cert_file": "c.pem" } } } } }),
-            json!({ "control_plane": { "tls": { "key_file": "k.pem" }, "auth": { "jwks": { "refresh_s": 60 } }, "store": {} } }),
+            json!({ "control_plane": { "tls": { "key_file": "k.pem" },
+                "auth": { "jwks": { "refresh_s": 60 } }, "store": {} } }),
             json!({ "cache": {}, "database": { "mongodb": {} }, "config": { "ca_file": "a.pem" } }),
         ] {
             assert_eq!(faults(&config), [""; 0], "{config}");
@@ -356,9 +375,10 @@ mod sections_of_the_node_file {
     #[test]
     fn what_is_in_a_list_is_complete() {
         assert_eq!(
-            faults(
-                &json!({ "control_plane": { "auth": { "keys": [ { "id": "k1" } ] } }, "brokers": { "plugins": [ {} ] } })
-            ),
+            faults(&json!({
+                "control_plane": { "auth": { "keys": [ { "id": "k1" } ] } },
+                "brokers": { "plugins": [ {} ] },
+            })),
             [
                 "/spec/config/brokers/plugins/0: needs one of ros2",
                 "/spec/config/control_plane/auth/keys/0/alg: is required",
@@ -370,12 +390,13 @@ mod sections_of_the_node_file {
     #[test]
     fn contradictions_stay_faults() {
         assert_eq!(
-            faults(
-                &json!({ "control_plane": { "auth": { "jwks": { "url": "https://idp/jwks", "file": "j.json" } } },
-                           "brokers": { "layer": { "dds": { "domain": 3, "interface": "10.0.0.1" }, "memory": {} } } })
-            ),
+            faults(&json!({ "control_plane": { "auth": { "jwks": { "url": "https://idp/jwks",
+                    "file": "j.json" } } },
+                           "brokers": { "layer": { "dds": { "domain": 3, "interface": "10.0.0.1" },
+                               "memory": {} } } })),
             [
-                "/spec/config/brokers/layer: holds dds and memory; only one of dds, kafka, memory is allowed",
+                "/spec/config/brokers/layer: holds dds and memory; only one of dds, kafka, memory \
+                 is allowed",
                 "/spec/config/control_plane/auth/jwks: needs one of url, file",
             ]
         );
@@ -402,20 +423,28 @@ mod sections_of_the_node_file {
     fn a_secret_stands_where_text_may_stand() {
         let secret = || json!({ "$secret": "canary" });
         for config in [
-            json!({ "cache": { "redis": { "url": secret() } }, "database": { "mongodb": { "uri": secret() } } }),
+            json!({
+                "cache": { "redis": { "url": secret() } },
+                "database": { "mongodb": { "uri": secret() } },
+            }),
             json!({ "brokers": { "layer": { "kafka": { "bootstrap": [secret()],
-                                                      "properties": { "sasl.password": secret(), "a[0].b": secret() } } } } }),
+                                                      "properties": { "sasl.password": secret(),
+                                                          "a[0].b": secret() } } } } }),
         ] {
             assert_eq!(faults(&config), [""; 0], "{config}");
         }
         assert_eq!(
-            faults(
-                &json!({ "flow": { "bandwidth": { "limit_mbps": secret() } }, "log": secret(), "worker": { "lease_ms": [secret()] } })
-            ),
+            faults(&json!({
+                "flow": { "bandwidth": { "limit_mbps": secret() } },
+                "log": secret(),
+                "worker": { "lease_ms": [secret()] },
+            })),
             [
-                "/spec/config/flow/bandwidth/limit_mbps: expected a number from 0.001 to 1000000, found text",
+                "/spec/config/flow/bandwidth/limit_mbps: expected a number from 0.001 to 1000000, \
+                 found text",
                 "/spec/config/log: expected a mapping, found text",
-                "/spec/config/worker/lease_ms: expected a whole number from 100 to 600000, found a list",
+                "/spec/config/worker/lease_ms: expected a whole number from 100 to 600000, found a \
+                 list",
             ]
         );
     }
@@ -423,14 +452,16 @@ mod sections_of_the_node_file {
     #[test]
     fn keys_with_points_and_brackets_keep_their_place() {
         assert_eq!(
-            faults(
-                &json!({ "brokers": { "layer": { "kafka": { "properties": { "a.b": [], "a": 1, "c[0]": {}, "x/y": null } } } },
-                           "flow": { "bandwidth": { "links": { "a.b": { "limit_mbps": 1 } } } } })
-            ),
+            faults(&json!({ "brokers": { "layer": { "kafka": { "properties": { "a.b": [], "a": 1,
+                    "c[0]": {}, "x/y": null } } } },
+                           "flow": { "bandwidth": { "links": { "a.b": { "limit_mbps": 1 } } } } })),
             [
-                "/spec/config/brokers/layer/kafka/properties/a.b: expected text, a number or true or false, found a list",
-                "/spec/config/brokers/layer/kafka/properties/c[0]: expected text, a number or true or false, found a mapping",
-                "/spec/config/flow/bandwidth/links/a.b: the name of a layer holds '.'; allowed are a-z, 0-9 and -",
+                "/spec/config/brokers/layer/kafka/properties/a.b: expected text, a number or true \
+                 or false, found a list",
+                "/spec/config/brokers/layer/kafka/properties/c[0]: expected text, a number or true \
+                 or false, found a mapping",
+                "/spec/config/flow/bandwidth/links/a.b: the name of a layer holds '.'; allowed are \
+                 a-z, 0-9 and -",
             ]
         );
     }
@@ -455,7 +486,8 @@ mod envelopes {
     #[test]
     fn the_path_fills_in_what_the_body_leaves_out() {
         let key: Key = "Instance/slam/0".parse().unwrap();
-        let body = json!({ "spec": { "node": "robot-1" }, "labels": { "a": "b" }, "uid": 5, "revision": "x", "status": {},
+        let body = json!({ "spec": { "node": "robot-1" }, "labels": { "a": "b" }, "uid": 5,
+            "revision": "x", "status": {},
                            "create_time": null, "update_time": 1, "updated_by": [] });
         let envelope = parse_envelope(body, Some(&key)).unwrap();
         assert_eq!(envelope.key().unwrap(), key);
@@ -463,11 +495,14 @@ mod envelopes {
             (envelope.spec, envelope.revision, envelope.delete),
             (json!({ "node": "robot-1" }), None, false)
         );
-        assert_eq!(
-            (envelope.labels, envelope.annotations),
-            (pairs(&[("a", "b")]), Labels::new())
-        );
-        let body = json!({ "kind": "Instance", "service": "slam", "name": "0", "spec": {}, "revision": 7 });
+        assert_eq!((envelope.labels, envelope.annotations), (pairs(&[("a", "b")]), Labels::new()));
+        let body = json!({
+            "kind": "Instance",
+            "service": "slam",
+            "name": "0",
+            "spec": {},
+            "revision": 7,
+        });
         assert_eq!(parse_envelope(body, Some(&key)).unwrap().revision, Some(7));
     }
 
@@ -494,7 +529,8 @@ mod envelopes {
     fn unknown_members_and_wrong_types_are_refused() {
         assert_eq!(
             faults(
-                json!({ "kind": "Nod", "name": 5, "lables": {}, "labels": { "a": 5, "b": null }, "annotations": [], "spec": [],
+                json!({ "kind": "Nod", "name": 5, "lables": {}, "labels": { "a": 5, "b": null },
+                    "annotations": [], "spec": [],
                         "delete": true }),
                 Some("Layer/a")
             ),
@@ -527,10 +563,7 @@ mod envelopes {
         assert!(envelope.delete && envelope.spec == json!({}) && envelope.revision == Some(3));
         assert_eq!(envelope.key().unwrap().to_string(), "Layer/a");
         assert_eq!(
-            faults(
-                json!({ "kind": "Layer", "name": "a", "delete": "yes", "revision": -3 }),
-                None
-            ),
+            faults(json!({ "kind": "Layer", "name": "a", "delete": "yes", "revision": -3 }), None),
             [
                 "/delete: expected true or false, found text",
                 "/spec: is required",
@@ -542,10 +575,7 @@ mod envelopes {
     #[test]
     fn keys_need_their_parts() {
         let key = |value: Value| {
-            parse_envelope(value, None)
-                .unwrap()
-                .key()
-                .map_err(|faults| lines(&faults))
+            parse_envelope(value, None).unwrap().key().map_err(|faults| lines(&faults))
         };
         for (value, faults) in [
             (json!({ "spec": {} }), vec!["/kind: is required", "/name: is required"]),
@@ -566,11 +596,15 @@ mod envelopes {
     #[test]
     fn a_new_document_names_itself() {
         let slam: ServiceName = "slam".parse().unwrap();
-        let envelope = parse_new(json!({ "name": "1", "spec": {} }), Kind::Instance, Some(&slam)).unwrap();
+        let envelope =
+            parse_new(json!({ "name": "1", "spec": {} }), Kind::Instance, Some(&slam)).unwrap();
         assert_eq!(envelope.key().unwrap().to_string(), "Instance/slam/1");
         let nameless = parse_new(json!({ "spec": {} }), Kind::Layer, None).unwrap();
         assert_eq!(lines(&nameless.key().unwrap_err()), ["/name: is required"]);
-        assert!(parse_new(json!({ "kind": "Node", "name": "a", "spec": {} }), Kind::Layer, None).is_err());
+        assert!(
+            parse_new(json!({ "kind": "Node", "name": "a", "spec": {} }), Kind::Layer, None)
+                .is_err()
+        );
     }
 
     #[test]
@@ -589,16 +623,8 @@ fn document(key: &str, spec: Value) -> Document {
 #[test]
 fn references_have_their_pointers() {
     for (key, spec, expected) in [
-        (
-            "Layer/edge",
-            json!({ "kind": "edge", "overrides": { "later": {} } }),
-            vec![],
-        ),
-        (
-            "Node/robot-1",
-            json!({ "layer": "edge" }),
-            vec!["/spec/layer Layer/edge"],
-        ),
+        ("Layer/edge", json!({ "kind": "edge", "overrides": { "later": {} } }), vec![]),
+        ("Node/robot-1", json!({ "layer": "edge" }), vec!["/spec/layer Layer/edge"]),
         (
             "Service/slam",
             json!({ "layers": ["edge", "fog"] }),
@@ -656,7 +682,11 @@ proptest! {
     fn any_sections_are_read_or_refused_with_a_place(section in prop::sample::select(NODE_FILE_SECTIONS.to_vec()), value in any_part()) {
         let spec = json!({ "config": { section: value } });
         for fault in check(&"Service/a".parse().unwrap(), &Labels::new(), &Labels::new(), &spec) {
-            prop_assert!(fault.pointer.starts_with(&format!("/spec/config/{section}")), "{:?}", fault);
+            prop_assert!(
+                fault.pointer.starts_with(&format!("/spec/config/{section}")),
+                "{:?}",
+                fault,
+            );
         }
     }
 

@@ -41,15 +41,9 @@ fn field(error: &FrameError) -> &'static str {
 #[test]
 fn compressed_and_back_is_the_same_frame() {
     let original = frame();
-    assert_eq!(
-        (original.compression(), original.uncompressed_bytes()),
-        (Compression::None, 0)
-    );
+    assert_eq!((original.compression(), original.uncompressed_bytes()), (Compression::None, 0));
     let packed = original.compressed(Bytes::from_static(b"packed"), 8).unwrap();
-    assert_eq!(
-        (packed.compression(), packed.uncompressed_bytes()),
-        (Compression::Lz4Block, 8)
-    );
+    assert_eq!((packed.compression(), packed.uncompressed_bytes()), (Compression::Lz4Block, 8));
     assert_eq!(packed.head().len(), original.head().len() + 4);
     assert_eq!(
         (packed.topic(), packed.writer(), packed.sequence()),
@@ -84,19 +78,13 @@ fn hops_and_age_stay_beside_the_header() {
 #[test]
 fn a_header_without_room_is_an_error() {
     let with_header_bytes = |bytes: usize| {
-        let of = |length: usize| Header {
-            traceparent: "t".repeat(length),
-            ..header()
-        };
+        let of = |length: usize| Header { traceparent: "t".repeat(length), ..header() };
         let short = Frame::new(&of(3_000), Bytes::new()).unwrap().head().len() - PREFIX_BYTES;
         Frame::new(&of(3_000 + bytes - short), Bytes::new()).unwrap()
     };
-    for (free, size, fits) in [
-        (4, 127, true),
-        (4, 128, false),
-        (7, MAX_PAYLOAD_BYTES as u64, true),
-        (0, 0, false),
-    ] {
+    for (free, size, fits) in
+        [(4, 127, true), (4, 128, false), (7, MAX_PAYLOAD_BYTES as u64, true), (0, 0, false)]
+    {
         let original = with_header_bytes(MAX_HEADER_BYTES - free);
         let packed = original.compressed(Bytes::from_static(b"p"), size);
         assert_eq!(packed.is_ok(), fits, "{free} bytes free, size {size}: {packed:?}");
@@ -111,19 +99,11 @@ fn a_header_without_room_is_an_error() {
 fn what_is_not_as_announced_is_refused() {
     let original = frame();
     let packed = original.compressed(Bytes::from_static(b"packed"), 8).unwrap();
-    assert_eq!(
-        field(&packed.compressed(Bytes::new(), 6).unwrap_err()),
-        "is set already"
-    );
-    assert_eq!(
-        field(&original.decompressed(Bytes::new()).unwrap_err()),
-        "is not LZ4_BLOCK"
-    );
+    assert_eq!(field(&packed.compressed(Bytes::new(), 6).unwrap_err()), "is set already");
+    assert_eq!(field(&original.decompressed(Bytes::new()).unwrap_err()), "is not LZ4_BLOCK");
     let other_size = packed.decompressed(Bytes::from_static(b"seven b")).unwrap_err();
     assert_eq!(field(&other_size), "is not the size of the payload");
-    let too_large = original
-        .compressed(Bytes::new(), MAX_PAYLOAD_BYTES as u64 + 1)
-        .unwrap_err();
+    let too_large = original.compressed(Bytes::new(), MAX_PAYLOAD_BYTES as u64 + 1).unwrap_err();
     assert_eq!(too_large, FrameError::PayloadTooLarge(MAX_PAYLOAD_BYTES + 1));
     assert!(original.compressed(Bytes::new(), u64::MAX).is_err());
     let header = |more: &[u8]| [&original.head()[PREFIX_BYTES..], more].concat();
@@ -132,14 +112,8 @@ fn what_is_not_as_announced_is_refused() {
     assert_eq!(field(&twice.decompressed(Bytes::new()).unwrap_err()), "is given twice");
     let unknown = from_header_bytes(&header(&[0x38, 9]), b"p").unwrap();
     assert_eq!(unknown.compression(), Compression::Unknown(9));
-    assert_eq!(
-        field(&unknown.decompressed(Bytes::new()).unwrap_err()),
-        "is not LZ4_BLOCK"
-    );
-    assert_eq!(
-        field(&unknown.compressed(Bytes::new(), 1).unwrap_err()),
-        "is set already"
-    );
+    assert_eq!(field(&unknown.decompressed(Bytes::new()).unwrap_err()), "is not LZ4_BLOCK");
+    assert_eq!(field(&unknown.compressed(Bytes::new(), 1).unwrap_err()), "is set already");
     let negative = [&[0x38][..], &[0xff; 9], &[1]].concat();
     let negative = from_header_bytes(&header(&negative), b"p").unwrap();
     assert_eq!(negative.compression(), Compression::Unknown(i32::MAX));
@@ -170,19 +144,24 @@ fn strange_field() -> impl Strategy<Value = Vec<u8>> {
         out
     };
     prop_oneof![
-        (17u32..20_000, proptest::collection::vec(any::<u8>(), 0..40)).prop_map(move |(tag, value)| bytes(
-            tag,
-            WireType::LengthDelimited,
-            &value
-        )),
+        (17u32..20_000, proptest::collection::vec(any::<u8>(), 0..40))
+            .prop_map(move |(tag, value)| bytes(tag, WireType::LengthDelimited, &value)),
         (17u32..20_000, any::<u64>()).prop_map(|(tag, value)| {
             let mut out = Vec::new();
             encode_key(tag, WireType::Varint, &mut out);
             encode_varint(value, &mut out);
             out
         }),
-        (17u32..20_000, any::<[u8; 4]>()).prop_map(move |(tag, value)| bytes(tag, WireType::ThirtyTwoBit, &value)),
-        (17u32..20_000, any::<[u8; 8]>()).prop_map(move |(tag, value)| bytes(tag, WireType::SixtyFourBit, &value)),
+        (17u32..20_000, any::<[u8; 4]>()).prop_map(move |(tag, value)| bytes(
+            tag,
+            WireType::ThirtyTwoBit,
+            &value
+        )),
+        (17u32..20_000, any::<[u8; 8]>()).prop_map(move |(tag, value)| bytes(
+            tag,
+            WireType::SixtyFourBit,
+            &value
+        )),
         Just(vec![0x38, 0]),
         Just(vec![0x38, 0x80, 0]),
         (0u8..128).prop_map(|size| vec![0x40, size]),
@@ -198,11 +177,16 @@ prop_compose! {
         sequence in 1u64..,
         publish_time_ns: u64,
         numbers: (u32, u32, u64, u32),
-        priority in prop_oneof![Just(None), Just(Some(Priority::Control)), Just(Some(Priority::Bulk))],
+        priority in prop_oneof![
+            Just(None),
+            Just(Some(Priority::Control)),
+            Just(Some(Priority::Bulk)),
+        ],
         reliable: bool,
     ) -> Header {
         let text = |at: usize| texts[at].clone();
-        let origin = Origin { layer: text(0), node: text(1), service: text(2), instance: text(3), epoch };
+        let origin =
+            Origin { layer: text(0), node: text(1), service: text(2), instance: text(3), epoch };
         Header {
             encoding: text(4),
             traceparent: text(5),
@@ -232,7 +216,9 @@ proptest! {
         let count = fields.len() as u64;
         let mut mixed = order;
         for at in 0..fields.len() {
-            mixed = mixed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            mixed =
+                mixed.wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             fields.swap(at, usize::try_from((mixed >> 33) % count).unwrap());
         }
         let mut original = from_header_bytes(&fields.concat(), &[7; 3_000][..size]).unwrap();
@@ -243,12 +229,15 @@ proptest! {
         prop_assert_eq!(packed.uncompressed_bytes(), size as u64);
         let back = packed.decompressed(original.payload().clone()).unwrap();
         prop_assert_eq!(&back, &original);
-        let received = Frame::parse(packed.to_bytes()).unwrap().decompressed(original.payload().clone()).unwrap();
+        let received =
+            Frame::parse(packed.to_bytes()).unwrap().decompressed(original.payload().clone())
+            .unwrap();
         prop_assert_eq!(received.to_bytes(), original.to_bytes());
     }
 
     #[test]
-    fn random_headers_never_panic(header in proptest::collection::vec(any::<u8>(), 0..60), more: bool) {
+    fn random_headers_never_panic(header in proptest::collection::vec(any::<u8>(), 0..60),
+        more: bool) {
         let mut bytes = header;
         if more {
             bytes.extend_from_slice(&frame().head()[PREFIX_BYTES..]);

@@ -1,4 +1,5 @@
-//! Drives a blaze-config (`BLAZE_SERVER`, `BLAZE_TOKEN`) through the client that progenitor makes of `openapi-3.0.json`.
+//! Drives a blaze-config (`BLAZE_SERVER`, `BLAZE_TOKEN`) through the client that progenitor makes
+//! of `openapi-3.0.json`.
 
 mod client {
     #![allow(clippy::all, unused, unused_comparisons, reason = "generated")]
@@ -42,7 +43,8 @@ async fn round_trip(server: &str, token: &str) -> anyhow::Result<()> {
 }
 
 fn connect(server: &str, token: &str) -> anyhow::Result<Client> {
-    let headers = HeaderMap::from_iter([(AUTHORIZATION, HeaderValue::from_str(&format!("Bearer {token}"))?)]);
+    let headers =
+        HeaderMap::from_iter([(AUTHORIZATION, HeaderValue::from_str(&format!("Bearer {token}"))?)]);
     let http = reqwest::Client::builder()
         .default_headers(headers)
         .timeout(Duration::from_secs(15))
@@ -59,7 +61,9 @@ fn body<T: DeserializeOwned>(value: Value) -> anyhow::Result<T> {
 async fn given<T: Debug>(answer: Answer<T>) -> anyhow::Result<ResponseValue<T>> {
     match answer {
         Ok(response) => Ok(response),
-        Err(Error::ErrorResponse(response)) => bail!("{}", String::from_utf8_lossy(&whole(response).await?)),
+        Err(Error::ErrorResponse(response)) => {
+            bail!("{}", String::from_utf8_lossy(&whole(response).await?))
+        }
         Err(error) => bail!("{error:?}"),
     }
 }
@@ -75,7 +79,11 @@ async fn whole(response: ResponseValue<ByteStream>) -> anyhow::Result<Vec<u8>> {
 }
 
 /// The refusal that is expected.
-async fn refused<T: Debug>(answer: Answer<T>, status: u16, code: &str) -> anyhow::Result<types::Problem> {
+async fn refused<T: Debug>(
+    answer: Answer<T>,
+    status: u16,
+    code: &str,
+) -> anyhow::Result<types::Problem> {
     let response = match answer {
         Err(Error::ErrorResponse(response)) => response,
         other => bail!("{other:?} instead of {status}"),
@@ -90,16 +98,15 @@ async fn refused<T: Debug>(answer: Answer<T>, status: u16, code: &str) -> anyhow
 }
 
 fn header<'a, T>(answer: &'a ResponseValue<T>, name: &str) -> anyhow::Result<&'a str> {
-    Ok(answer
-        .headers()
-        .get(name)
-        .with_context(|| format!("no {name}"))?
-        .to_str()?)
+    Ok(answer.headers().get(name).with_context(|| format!("no {name}"))?.to_str()?)
 }
 
 async fn created(client: &Client) -> anyhow::Result<()> {
     let edge: types::LayerInput = body(json!({
-        "name": "edge", "labels": { "site": "lab" }, "spec": { "kind": "edge", "config": { "log": { "level": "info" } } },
+        "name": "edge", "labels": { "site": "lab" }, "spec": {
+            "kind": "edge",
+            "config": { "log": { "level": "info" } },
+        },
     }))?;
     let layer = given(client.create_layer().body(edge).send().await).await?;
     ensure!(layer.status() == StatusCode::CREATED && layer.spec.kind == types::LayerSpecKind::Edge);
@@ -118,28 +125,20 @@ async fn created(client: &Client) -> anyhow::Result<()> {
             .try_into()?;
         let key = format!("make-{name}");
         let node = given(
-            client
-                .create_node()
-                .idempotency_key(key.as_str())
-                .body(input.clone())
-                .send()
-                .await,
+            client.create_node().idempotency_key(key.as_str()).body(input.clone()).send().await,
         )
         .await?;
-        let again = given(
-            client
-                .create_node()
-                .idempotency_key(key.as_str())
-                .body(input)
-                .send()
-                .await,
-        )
-        .await?;
+        let again =
+            given(client.create_node().idempotency_key(key.as_str()).body(input).send().await)
+                .await?;
         ensure!(header(&again, "idempotent-replayed")? == "true" && again.uid == node.uid);
     }
 
     let slam: types::ServiceInput = body(json!({
-        "name": "slam", "spec": { "config": { "camera": { "rate_hz": 30 } }, "schema": { "type": "object" } },
+        "name": "slam", "spec": {
+            "config": { "camera": { "rate_hz": 30 } },
+            "schema": { "type": "object" },
+        },
     }))?;
     let service = given(client.create_service().body(slam).send().await).await?;
     ensure!(
@@ -153,7 +152,8 @@ async fn paged(client: &Client) -> anyhow::Result<()> {
     let mut names = Vec::new();
     let mut token = String::new();
     loop {
-        let page = given(client.list_nodes().limit(2).page_token(token.as_str()).send().await).await?;
+        let page =
+            given(client.list_nodes().limit(2).page_token(token.as_str()).send().await).await?;
         ensure!(page.items.len() <= 2, "{page:?}");
         names.extend(page.items.iter().map(|node| node.name.to_string()));
         token.clone_from(&page.next_page_token);
@@ -189,18 +189,14 @@ async fn replaced(client: &Client) -> anyhow::Result<()> {
 }
 
 async fn patched(client: &Client) -> anyhow::Result<()> {
-    let patch: types::DocumentPatch =
-        body(json!({ "labels": { "site": "lab" }, "spec": { "config": { "camera": { "rate_hz": 20 } } } }))?;
-    let service = given(
-        client
-            .patch_service()
-            .name("slam")
-            .if_match("*")
-            .body(patch)
-            .send()
-            .await,
-    )
-    .await?;
+    let patch: types::DocumentPatch = body(
+        json!({
+            "labels": { "site": "lab" },
+            "spec": { "config": { "camera": { "rate_hz": 20 } } },
+        }),
+    )?;
+    let service =
+        given(client.patch_service().name("slam").if_match("*").body(patch).send().await).await?;
     let config = service.spec.config.as_ref().context("no config")?;
     ensure!(
         config.get("camera") == Some(&json!({ "rate_hz": 20 })) && service.labels.len() == 1,
@@ -217,29 +213,16 @@ async fn applied(client: &Client) -> anyhow::Result<()> {
     ]))?;
     let dry = given(client.apply().dry_run(true).body(items.clone()).send().await).await?;
     let report = given(client.apply().body(items).send().await).await?;
-    ensure!(
-        dry.dry_run && !report.dry_run && report.revision == dry.revision + 1,
-        "{report:?}"
-    );
+    ensure!(dry.dry_run && !report.dry_run && report.revision == dry.revision + 1, "{report:?}");
     ensure!(report.results.len() == 2 && report.affected.len() == 1, "{report:?}");
     ensure!(
-        report
-            .results
-            .iter()
-            .all(|result| result.action == types::ApplyResultAction::Created),
+        report.results.iter().all(|result| result.action == types::ApplyResultAction::Created),
         "{report:?}"
     );
 
-    let effective = given(
-        client
-            .get_effective()
-            .service("slam")
-            .instance("0")
-            .explain(true)
-            .send()
-            .await,
-    )
-    .await?;
+    let effective =
+        given(client.get_effective().service("slam").instance("0").explain(true).send().await)
+            .await?;
     ensure!(
         effective.layer.as_deref() == Some("edge") && effective.node.as_deref() == Some("robot-1"),
         "{effective:?}"
@@ -260,7 +243,8 @@ async fn applied(client: &Client) -> anyhow::Result<()> {
 
 async fn remembered(client: &Client) -> anyhow::Result<()> {
     let history = given(client.list_node_history().name("robot-1").send().await).await?;
-    let operations: Vec<types::HistoryEntryOp> = history.items.iter().map(|entry| entry.op).collect();
+    let operations: Vec<types::HistoryEntryOp> =
+        history.items.iter().map(|entry| entry.op).collect();
     ensure!(
         operations == [types::HistoryEntryOp::Update, types::HistoryEntryOp::Create],
         "{history:?}"
@@ -275,29 +259,14 @@ async fn remembered(client: &Client) -> anyhow::Result<()> {
 }
 
 async fn deleted(client: &Client) -> anyhow::Result<()> {
-    let blind = refused(
-        client.delete_node().name("robot-2").send().await,
-        428,
-        "precondition_required",
-    )
-    .await?;
+    let blind =
+        refused(client.delete_node().name("robot-2").send().await, 428, "precondition_required")
+            .await?;
     let etag = format!("\"{}\"", blind.revision.context("no revision")?);
-    let gone = given(
-        client
-            .delete_node()
-            .name("robot-2")
-            .if_match(etag.as_str())
-            .send()
-            .await,
-    )
-    .await?;
+    let gone =
+        given(client.delete_node().name("robot-2").if_match(etag.as_str()).send().await).await?;
     ensure!(gone.status() == StatusCode::NO_CONTENT);
     refused(client.get_node().name("robot-2").send().await, 404, "not_found").await?;
-    refused(
-        client.delete_node().name("robot-1").if_match("*").send().await,
-        409,
-        "in_use",
-    )
-    .await?;
+    refused(client.delete_node().name("robot-1").if_match("*").send().await, 409, "in_use").await?;
     Ok(())
 }

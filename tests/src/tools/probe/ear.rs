@@ -46,10 +46,8 @@ impl Ear {
     async fn open(service: &ServiceManager, topic: &Topic) -> anyhow::Result<Self> {
         let heard = Arc::<Heard>::default();
         let kept = Arc::clone(&heard);
-        let subscribe = SubscribeOptions {
-            large: topic.bytes >= LARGE_BYTES,
-            ..SubscribeOptions::default()
-        };
+        let subscribe =
+            SubscribeOptions { large: topic.bytes >= LARGE_BYTES, ..SubscribeOptions::default() };
         let hear = move |message: Message| {
             kept.last.store(message.sequence().unwrap_or(0), Ordering::Relaxed);
             let mut latencies = kept.latencies_us.lock();

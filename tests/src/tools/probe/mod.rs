@@ -1,5 +1,5 @@
-//! A service which publishes or listens, and counts. Tests run several of them on one machine, also in network namespaces;
-//! since they share a clock, the latencies are true.
+//! A service which publishes or listens, and counts. Tests run several of them on one machine, also
+//! in network namespaces; since they share a clock, the latencies are true.
 
 mod ear;
 mod source;
@@ -29,7 +29,8 @@ pub(crate) enum Role {
     Listen,
 }
 
-/// Publishes or listens, and counts. SIGUSR1 ends the publishing; it stays until it is ended itself or its time is over.
+/// Publishes or listens, and counts. SIGUSR1 ends the publishing; it stays until it is ended itself
+/// or its time is over.
 #[derive(Debug, Clone, Parser)]
 pub(crate) struct Options {
     pub(crate) role: Role,
@@ -48,7 +49,8 @@ pub(crate) struct Options {
     pub(crate) node: NodeName,
     #[arg(long, default_value = "probe")]
     pub(crate) service: ServiceName,
-    /// `NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,@FILE]`; without a file of payloads they are noise
+    /// `NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,@FILE]`; without a file of payloads they
+    /// are noise
     #[arg(long, required = true)]
     pub(crate) topic: Vec<Topic>,
     /// Seconds
@@ -81,11 +83,15 @@ impl FromStr for Topic {
     fn from_str(text: &str) -> anyhow::Result<Self> {
         let parts: Vec<&str> = text.split(',').collect();
         let (parts, payload) = match parts[..] {
-            [ref terms @ .., file] if file.starts_with('@') => (terms, Payload::File(file[1..].into())),
+            [ref terms @ .., file] if file.starts_with('@') => {
+                (terms, Payload::File(file[1..].into()))
+            }
             ref terms => (terms, Payload::Noise),
         };
         let [name, reliability, hz, bytes, lifespan] = *parts else {
-            anyhow::bail!("{text}: NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,@FILE] is expected")
+            anyhow::bail!(
+                "{text}: NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,@FILE] is expected"
+            )
         };
         Ok(Self {
             name: name.parse()?,
@@ -110,11 +116,7 @@ pub(crate) async fn run(options: &Options) -> anyhow::Result<()> {
     tokio::time::timeout(START, status.wait_for(|status| status.health == Health::Up))
         .await
         .context("the broker does not answer")??;
-    let scope = if options.redis.is_some() {
-        Scope::Node
-    } else {
-        Scope::Layer
-    };
+    let scope = if options.redis.is_some() { Scope::Node } else { Scope::Layer };
     let service = ServiceOptions::new(
         options.layer.clone(),
         options.service.clone(),

@@ -59,7 +59,8 @@ fn payloads(kind: &Payload, bytes: usize) -> anyhow::Result<Vec<Bytes>> {
         }
         Payload::File(path) => {
             let parts = std::fs::read(path).with_context(|| format!("{}", path.display()))?;
-            let parts: Vec<Bytes> = parts.chunks_exact(bytes.max(1)).map(Bytes::copy_from_slice).collect();
+            let parts: Vec<Bytes> =
+                parts.chunks_exact(bytes.max(1)).map(Bytes::copy_from_slice).collect();
             anyhow::ensure!(!parts.is_empty(), "{} is shorter than {bytes} bytes", path.display());
             Ok(parts)
         }
@@ -101,8 +102,5 @@ fn print(sources: &[Source], ended: bool) {
         })
     });
     let topics: Vec<_> = topics.collect();
-    println!(
-        "{}",
-        serde_json::json!({ "kind": "row", "ended": ended, "topics": topics })
-    );
+    println!("{}", serde_json::json!({ "kind": "row", "ended": ended, "topics": topics }));
 }

@@ -21,13 +21,11 @@ pub(crate) fn open(namespace: &str, name: &str, mtu: u16) -> anyhow::Result<Tun>
     inside(namespace, || {
         let mut configuration = tun::configure();
         configuration.tun_name(name).mtu(mtu).up();
-        let device = tun::create(&configuration).with_context(|| format!("a TUN device {name} in {namespace}"))?;
-        let counters = File::open("/proc/thread-self/net/dev").context("the counters of the interfaces")?;
-        Ok(Tun {
-            device,
-            name: name.to_owned(),
-            counters: Mutex::new(counters),
-        })
+        let device = tun::create(&configuration)
+            .with_context(|| format!("a TUN device {name} in {namespace}"))?;
+        let counters =
+            File::open("/proc/thread-self/net/dev").context("the counters of the interfaces")?;
+        Ok(Tun { device, name: name.to_owned(), counters: Mutex::new(counters) })
     })
 }
 
@@ -42,7 +40,8 @@ impl Tun {
         self.device.send(packet).map(|_| ())
     }
 
-    /// Packets that the namespace wanted to send and the kernel dropped, because its queue was full.
+    /// Packets that the namespace wanted to send and the kernel dropped, because its queue was
+    /// full.
     pub(crate) fn missed(&self) -> anyhow::Result<u64> {
         let mut text = String::new();
         let mut counters = self.counters.lock();

@@ -58,7 +58,8 @@ impl Line {
         loop {
             self.wait_for(&mut batch);
             for packet in batch.drain(..) {
-                // A namespace that is going, or an interface that somebody set down: the packet is lost there.
+                // A namespace that is going, or an interface that somebody set down: the packet is
+                // lost there.
                 if self.to.send(&packet).is_err() {
                     self.refused.fetch_add(1, Ordering::Relaxed);
                 }
@@ -102,11 +103,7 @@ impl Line {
     pub(crate) fn stats(&self) -> anyhow::Result<DirectionStats> {
         let missed = self.from.missed()?;
         let counted = self.direction.lock().stats();
-        Ok(DirectionStats {
-            refused: self.refused.load(Ordering::Relaxed),
-            missed,
-            ..counted
-        })
+        Ok(DirectionStats { refused: self.refused.load(Ordering::Relaxed), missed, ..counted })
     }
 
     fn update(&self, act: impl FnOnce(&mut Direction<Packet>)) {

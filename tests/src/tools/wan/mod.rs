@@ -1,12 +1,14 @@
-//! A link emulator: one point-to-point IP link between two network namespaces, over a TUN device in each.
+//! A link emulator: one point-to-point IP link between two network namespaces, over a TUN device in
+//! each.
 //!
 //! ```text
 //! namespace A: w0 ─► reader ─► Direction a>b ─► writer ─► w0 :namespace B
 //!              w0 ◄─ writer ◄─ Direction b>a ◄─ reader ◄─ w0
 //! ```
 //!
-//! Commands come one a line on stdin; each is answered by one line of JSON on stdout. It ends when stdin does. Addresses and
-//! routes are whoever's who starts it: `ip -n A addr add 10.0.0.1/30 dev w0`.
+//! Commands come one a line on stdin; each is answered by one line of JSON on stdout. It ends when
+//! stdin does. Addresses and routes are whoever's who starts it: `ip -n A addr add 10.0.0.1/30 dev
+//! w0`.
 
 mod device;
 mod forward;
@@ -25,8 +27,8 @@ use self::forward::Line;
 
 /// One emulated IP link between two network namespaces.
 ///
-/// Commands on stdin, each a line of JSON: `{"set":["both",[{"loss":0.01},{"rate":5000000}]]}`, `{"cut":"forward"}`,
-/// `{"heal":"forward"}`, `"stats"`.
+/// Commands on stdin, each a line of JSON: `{"set":["both",[{"loss":0.01},{"rate":5000000}]]}`,
+/// `{"cut":"forward"}`, `{"heal":"forward"}`, `"stats"`.
 #[derive(Debug, Parser)]
 pub(crate) struct Options {
     /// Namespace at one end, as `ip netns list` names it
@@ -47,7 +49,8 @@ pub(crate) struct Options {
     /// MTU of the device in B
     #[arg(long, default_value_t = 1500, value_parser = clap::value_parser!(u16).range(68..))]
     b_mtu: u16,
-    /// Of the generator that loses and delays: the same packets at the same times have the same fate
+    /// Of the generator that loses and delays: the same packets at the same times have the same
+    /// fate
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// A command to begin with; may be repeated
@@ -69,8 +72,10 @@ async fn emulate(options: Options) -> anyhow::Result<()> {
     let supervisor = Supervisor::new("blaze-testbed");
     for (name, line) in [("a>b", &link.forward), ("b>a", &link.back)] {
         let (reader, writer) = (Arc::clone(line), Arc::clone(line));
-        supervisor.spawn_thread(format!("{name} in"), TaskPolicy::Essential, move || reader.read())?;
-        supervisor.spawn_thread(format!("{name} out"), TaskPolicy::Essential, move || writer.write())?;
+        supervisor
+            .spawn_thread(format!("{name} in"), TaskPolicy::Essential, move || reader.read())?;
+        supervisor
+            .spawn_thread(format!("{name} out"), TaskPolicy::Essential, move || writer.write())?;
     }
     let (done, ended) = tokio::sync::oneshot::channel();
     supervisor.spawn_thread("commands", TaskPolicy::MayEnd, move || {
@@ -110,11 +115,15 @@ impl Link {
 
     fn obey(&self, command: &Command) -> anyhow::Result<serde_json::Value> {
         match command {
-            Command::Set(ways, changes) => self.lines(*ways).iter().for_each(|line| line.change(changes)),
+            Command::Set(ways, changes) => {
+                self.lines(*ways).iter().for_each(|line| line.change(changes))
+            }
             Command::Cut(ways) => self.lines(*ways).iter().for_each(|line| line.cut()),
             Command::Heal(ways) => self.lines(*ways).iter().for_each(|line| line.heal()),
             Command::Stats => {
-                return Ok(json!({ "ok": true, "a>b": self.forward.stats()?, "b>a": self.back.stats()? }));
+                return Ok(
+                    json!({ "ok": true, "a>b": self.forward.stats()?, "b>a": self.back.stats()? }),
+                );
             }
         }
         Ok(json!({ "ok": true }))

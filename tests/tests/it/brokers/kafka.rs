@@ -15,8 +15,8 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use blaze_brokers::kafka::KafkaBroker;
 use blaze_brokers::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, PublishOutcome, Publisher,
-    PublisherOptions, Received, Role, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, PublishOutcome,
+    Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::KafkaBroker as Section;
@@ -46,10 +46,7 @@ pub(crate) fn section(server: &KafkaServer, prefix: &str) -> Section {
 }
 
 pub(crate) fn flow_role() -> Role {
-    Role::Flow {
-        flow: "fog/server-1".parse().unwrap(),
-        epoch: 1,
-    }
+    Role::Flow { flow: "fog/server-1".parse().unwrap(), epoch: 1 }
 }
 
 pub(crate) fn open(server: &KafkaServer, role: &Role) -> KafkaBroker {
@@ -76,11 +73,7 @@ impl Flow {
         health(&broker, Health::Up).await;
         let side = broker.flow_side().unwrap();
         let bootstrap = server.bootstrap();
-        Self {
-            broker,
-            side,
-            bootstrap,
-        }
+        Self { broker, side, bootstrap }
     }
 
     /// A channel of a new name, which the server has when this returns.
@@ -95,17 +88,20 @@ impl Flow {
 }
 
 /// Subscribes as soon as the server has the topic.
-pub(crate) async fn subscribe(broker: &dyn Broker, channel: &ChannelName, options: SubscribeOptions) -> Reader {
+pub(crate) async fn subscribe(
+    broker: &dyn Broker,
+    channel: &ChannelName,
+    options: SubscribeOptions,
+) -> Reader {
     let until = Instant::now() + DEADLINE;
     loop {
         match broker.subscribe(channel, options).await {
             Ok(subscription) => {
-                return Reader {
-                    subscription,
-                    waiting: Vec::new(),
-                };
+                return Reader { subscription, waiting: Vec::new() };
             }
-            Err(BrokerError::Away(_)) if Instant::now() < until => tokio::time::sleep(Duration::from_millis(10)).await,
+            Err(BrokerError::Away(_)) if Instant::now() < until => {
+                tokio::time::sleep(Duration::from_millis(10)).await
+            }
             Err(error) => panic!("{channel}: {error}"),
         }
     }
@@ -166,12 +162,12 @@ pub(crate) fn frame(channel: &ChannelName, writer: u8, sequence: u64) -> Frame {
     Frame::new(&header, Bytes::from(sequence.to_string())).unwrap()
 }
 
-pub(crate) fn publisher(broker: &dyn Broker, channel: &ChannelName, depth: u32) -> Arc<dyn Publisher> {
-    let options = PublisherOptions {
-        depth,
-        reliable: true,
-        large: false,
-    };
+pub(crate) fn publisher(
+    broker: &dyn Broker,
+    channel: &ChannelName,
+    depth: u32,
+) -> Arc<dyn Publisher> {
+    let options = PublisherOptions { depth, reliable: true, large: false };
     broker.publisher(channel, options).unwrap()
 }
 
@@ -204,12 +200,20 @@ impl Broker for Prepared {
         self.client.status()
     }
 
-    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError> {
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError> {
         self.side.prepare(channel, options.depth)?;
         self.client.publisher(channel, options)
     }
 
-    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
         self.side.prepare(channel, 0)?;
         let until = Instant::now() + Duration::from_secs(10);
         loop {

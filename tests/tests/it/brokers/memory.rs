@@ -19,20 +19,14 @@ struct Memory {
 
 impl Memory {
     async fn start() -> Self {
-        Self {
-            hub: MemoryHub::new("conformance"),
-        }
+        Self { hub: MemoryHub::new("conformance") }
     }
 }
 
 #[async_trait]
 impl Fixture for Memory {
     fn capabilities(&self) -> Capabilities {
-        Capabilities {
-            queue_bytes: 0,
-            channels: 5_000,
-            ..Capabilities::default()
-        }
+        Capabilities { queue_bytes: 0, channels: 5_000, ..Capabilities::default() }
     }
 
     async fn broker(&self) -> Result<Arc<dyn Broker>, String> {
@@ -77,16 +71,11 @@ fn frame(sequence: u64, payload: Bytes) -> Frame {
 async fn payloads_are_shared_not_copied() {
     let hub = MemoryHub::new("shared");
     let broker = hub.broker();
-    let mut subscription = broker
-        .subscribe(&channel("t"), SubscribeOptions::default())
-        .await
-        .unwrap();
+    let mut subscription =
+        broker.subscribe(&channel("t"), SubscribeOptions::default()).await.unwrap();
     let publisher = broker.publisher(&channel("t"), PublisherOptions::default()).unwrap();
     let payload = Bytes::from(vec![7; 1_000_000]);
-    assert_eq!(
-        publisher.publish(&frame(1, payload.clone()), None),
-        PublishOutcome::Taken
-    );
+    assert_eq!(publisher.publish(&frame(1, payload.clone()), None), PublishOutcome::Taken);
     let mut batch = Vec::new();
     subscription.receive(&mut batch, 1).await;
     let Content::Frame(found) = &batch[0].content else {
@@ -113,10 +102,7 @@ async fn channels_that_nobody_uses_are_forgotten() {
 async fn kept_messages_tell_how_long_they_lay_there() {
     let hub = MemoryHub::new("kept");
     let broker = hub.broker();
-    let options = PublisherOptions {
-        depth: 1,
-        ..PublisherOptions::default()
-    };
+    let options = PublisherOptions { depth: 1, ..PublisherOptions::default() };
     let publisher = broker.publisher(&channel("t"), options).unwrap();
     let before = std::time::Instant::now();
     publisher.publish(&frame(1, Bytes::new()), None);

@@ -1,5 +1,5 @@
-//! The adapters against real servers (`scripts/services install`) and over loopback: the conformance suite, and what only a real
-//! server or network does.
+//! The adapters against real servers (`scripts/services install`) and over loopback: the
+//! conformance suite, and what only a real server or network does.
 
 mod dds;
 mod kafka;

@@ -29,7 +29,8 @@ pub(super) fn frame(topic: &str, number: u8, sequence: u64, bytes: usize) -> Fra
 /// Waits until a client's health is as given, and gives its detail.
 pub(super) async fn wait_for(broker: &dyn Broker, health: Health) -> String {
     let mut status = broker.status();
-    let waited = tokio::time::timeout(DEADLINE, status.wait_for(|status| status.health == health)).await;
+    let waited =
+        tokio::time::timeout(DEADLINE, status.wait_for(|status| status.health == health)).await;
     match waited {
         Ok(status) => status.unwrap().detail.clone(),
         Err(_) => panic!("not {health:?} within {DEADLINE:?}: {:?}", broker.status().borrow()),

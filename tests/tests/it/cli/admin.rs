@@ -38,7 +38,9 @@ const TOPICS: &str = r#"{"flow":"edge/robot-1","epoch":18446744073709551615,"tim
 
 fn flow(path: &str) -> (u16, String) {
     let why = |verdict: &str, code: &str| {
-        let step = format!(r#"{{"flow":"edge/robot-1","step":"advertise","ok":true,"code":"{code}","detail":""}}"#);
+        let step = format!(
+            r#"{{"flow":"edge/robot-1","step":"advertise","ok":true,"code":"{code}","detail":""}}"#
+        );
         format!(
             r#"{{"topic":"t","to":"cloud","verdict":"{verdict}","code":"{code}","remedy":"Do this.","steps":[{step}]}}"#
         )
@@ -46,10 +48,9 @@ fn flow(path: &str) -> (u16, String) {
     match path {
         "/v1/topics" => (200, TOPICS.to_owned()),
         "/v1/bridges" => (200, r#"{"flow":"edge/robot-1","bridges":[]}"#.to_owned()),
-        "/v1/peers" => (
-            403,
-            r#"{"error":{"code":"access_denied","detail":"a token is needed"}}"#.to_owned(),
-        ),
+        "/v1/peers" => {
+            (403, r#"{"error":{"code":"access_denied","detail":"a token is needed"}}"#.to_owned())
+        }
         "/v1/why?topic=imu/data&to=cloud/cloud-1" => (200, why("flowing", "ok")),
         "/v1/why?topic=camera/image_raw" => (200, why("degraded", "rate_limited")),
         "/v1/why?topic=imu/dta" => (200, why("not_flowing", "no_advertise")),
@@ -101,10 +102,7 @@ fn a_port_where_nobody_listens_says_so() {
     let said = blaze("topics", address);
     assert_eq!(said.code, 3);
     let text = said.stderr;
-    assert!(
-        text.contains(&address.to_string()) && text.contains("--flow HOST:PORT"),
-        "{text}"
-    );
+    assert!(text.contains(&address.to_string()) && text.contains("--flow HOST:PORT"), "{text}");
 }
 
 #[test]

@@ -26,36 +26,29 @@ fn it_waits_for_workers_that_are_connected_and_for_no_others() {
         stage.path("worker")
     );
     let node_file = stage.write("robot-1.yaml", &node_file);
-    let worker = Process::start("blaze-worker", &["--config", node_file.to_str().unwrap()], None).unwrap();
+    let worker =
+        Process::start("blaze-worker", &["--config", node_file.to_str().unwrap()], None).unwrap();
     ready(&worker);
-    let connected = || stage.blaze(&main, "workers -o json").json()["items"][0]["connected"] == true;
+    let connected =
+        || stage.blaze(&main, "workers -o json").json()["items"][0]["connected"] == true;
     wait::until("the worker is known", PATIENCE, connected, || worker.tail()).unwrap();
 
-    let second = stage.write(
-        "second.yaml",
-        "kind: Service\nname: slam\nspec: { config: { rate_hz: 20 } }\n",
-    );
+    let second = stage
+        .write("second.yaml", "kind: Service\nname: slam\nspec: { config: { rate_hz: 20 } }\n");
     let second = format!("apply -f {} --wait 20s", second.display());
     let reached = stage.blaze(&main, &second);
     assert_eq!(reached.code, 0, "{reached:?}");
-    assert!(
-        reached.stderr.contains("1 worker concerned: all have revision"),
-        "{reached:?}"
-    );
-    let revision = stage.blaze(&main, "get svc slam -o json").json()["revision"]
-        .as_u64()
-        .unwrap();
-    let has = stage.blaze(&main, "workers -o json").json()["items"][0]["revision"]
-        .as_u64()
-        .unwrap();
+    assert!(reached.stderr.contains("1 worker concerned: all have revision"), "{reached:?}");
+    let revision = stage.blaze(&main, "get svc slam -o json").json()["revision"].as_u64().unwrap();
+    let has =
+        stage.blaze(&main, "workers -o json").json()["items"][0]["revision"].as_u64().unwrap();
     assert!(has >= revision, "{has} of {revision}");
 
-    // One that stands still has nothing yet: also when the same is applied again, which changes nothing.
+    // One that stands still has nothing yet: also when the same is applied again, which changes
+    // nothing.
     worker.signal(Signal::STOP).unwrap();
-    let third = stage.write(
-        "third.yaml",
-        "kind: Service\nname: slam\nspec: { config: { rate_hz: 30 } }\n",
-    );
+    let third =
+        stage.write("third.yaml", "kind: Service\nname: slam\nspec: { config: { rate_hz: 30 } }\n");
     let third = format!("apply -f {}", third.display());
     for action in ["updated", "unchanged"] {
         let late = stage.blaze(&main, &format!("{third} --wait 500ms -o json"));

@@ -57,9 +57,7 @@ async fn service(url: &str) -> ServiceManager {
         Arc::clone(&broker),
         Scope::Node,
     );
-    ServiceManager::start(options.on_node("dev-1".parse().unwrap()))
-        .await
-        .unwrap()
+    ServiceManager::start(options.on_node("dev-1".parse().unwrap())).await.unwrap()
 }
 
 pub(crate) async fn put(rest: &str, path: &str, body: &Value) -> u64 {
@@ -67,25 +65,18 @@ pub(crate) async fn put(rest: &str, path: &str, body: &Value) -> u64 {
     let answer = request.header("if-match", "*").json(body).send().await.unwrap();
     let (status, text) = (answer.status(), answer.text().await.unwrap());
     assert!(status.is_success(), "{status} {text}");
-    serde_json::from_str::<Value>(&text).unwrap()["revision"]
-        .as_u64()
-        .unwrap()
+    serde_json::from_str::<Value>(&text).unwrap()["revision"].as_u64().unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_change_over_rest_is_heard_by_a_service() {
     let stage = Stage::new();
-    let file = stage.write(
-        "slam.yaml",
-        "kind: Service\nname: slam\nspec: { config: { rate_hz: 10 } }\n",
-    );
+    let file =
+        stage.write("slam.yaml", "kind: Service\nname: slam\nspec: { config: { rate_hz: 10 } }\n");
     let mut process = dev_on_redis(&["-f", file.to_str().unwrap()]);
     let places = ready(&process);
     for (name, place) in places.iter().filter(|(name, _)| *name != "broker") {
-        assert!(
-            place.parse::<SocketAddr>().unwrap().ip().is_loopback(),
-            "{name}={place}"
-        );
+        assert!(place.parse::<SocketAddr>().unwrap().ip().is_loopback(), "{name}={place}");
     }
     let service = service(&places["broker"]).await;
     let config = service.config();
@@ -98,12 +89,9 @@ async fn a_change_over_rest_is_heard_by_a_service() {
         (config.value().as_deref(), config.source()),
         (Some(&json!({ "rate_hz": 10 })), Some(ConfigSource::Main))
     );
-    let revision = put(
-        &places["rest"],
-        "/services/slam",
-        &json!({ "spec": { "config": { "rate_hz": 25 } } }),
-    )
-    .await;
+    let revision =
+        put(&places["rest"], "/services/slam", &json!({ "spec": { "config": { "rate_hz": 25 } } }))
+            .await;
     let heard = async {
         loop {
             let (at, new) = hears.recv().await.expect("the service runs");
@@ -112,9 +100,7 @@ async fn a_change_over_rest_is_heard_by_a_service() {
             }
         }
     };
-    let heard = tokio::time::timeout(PATIENCE, heard)
-        .await
-        .expect("it hears of the change");
+    let heard = tokio::time::timeout(PATIENCE, heard).await.expect("it hears of the change");
     assert_eq!(heard.as_deref(), Some(&json!({ "rate_hz": 25 })));
     service.shutdown().await;
 
@@ -139,24 +125,16 @@ fn what_is_kept_is_there_again_and_what_is_there_is_left_as_it_is() {
     let mut first = dev(&data, None);
     let places = ready(&first);
     let server = format!("http://{}", places["rest"]);
-    let patch = [
-        "patch",
-        "node",
-        "dev-1",
-        "-p",
-        "{\"labels\":{\"mine\":\"yes\"}}",
-        "--server",
-        &server,
-    ];
+    let patch =
+        ["patch", "node", "dev-1", "-p", "{\"labels\":{\"mine\":\"yes\"}}", "--server", &server];
     let changed = stage.run("blaze", &patch);
     assert_eq!(changed.code, 0, "{changed:?}");
     assert_eq!(first.terminate(PATIENCE).unwrap(), Some(0), "{}", first.tail());
     let mut second = dev(&data, None);
     let places = ready(&second);
     let server = format!("http://{}", places["rest"]);
-    let node = stage
-        .run("blaze", &["get", "node", "dev-1", "-o", "json", "--server", &server])
-        .json();
+    let node =
+        stage.run("blaze", &["get", "node", "dev-1", "-o", "json", "--server", &server]).json();
     assert_eq!(node["labels"], json!({ "mine": "yes" }), "{node}");
     assert_eq!(second.terminate(PATIENCE).unwrap(), Some(0), "{}", second.tail());
 }
@@ -167,11 +145,7 @@ fn what_cannot_be_started_is_told_with_what_to_do() {
     let nowhere = stage.path("");
     let mut without = dev(&["--broker", "redis"], Some(nowhere.as_os_str()));
     assert_eq!(without.exit(PATIENCE).unwrap(), Some(2), "{}", without.tail());
-    assert!(
-        without.tail().contains("--broker redis://HOST:PORT"),
-        "{}",
-        without.tail()
-    );
+    assert!(without.tail().contains("--broker redis://HOST:PORT"), "{}", without.tail());
 
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = taken.local_addr().unwrap();
@@ -182,10 +156,8 @@ fn what_cannot_be_started_is_told_with_what_to_do() {
     assert!(busy.tail().contains(&taken.port().to_string()), "{}", busy.tail());
     drop(held);
 
-    let mut open = dev(
-        &["--broker", "memory", "--set", "control_plane.rest.listen=0.0.0.0:0"],
-        None,
-    );
+    let mut open =
+        dev(&["--broker", "memory", "--set", "control_plane.rest.listen=0.0.0.0:0"], None);
     assert_eq!(open.exit(PATIENCE).unwrap(), Some(2), "{}", open.tail());
 
     let bad = stage.write("bad.yaml", "kind: Node\nname: x\nspec: { layer: nowhere }\n");

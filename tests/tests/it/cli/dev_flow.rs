@@ -1,4 +1,5 @@
-//! The flow within `blaze dev` follows BlazeConfig as `blaze-flow` does: it takes what it can, and says what it cannot.
+//! The flow within `blaze dev` follows BlazeConfig as `blaze-flow` does: it takes what it can, and
+//! says what it cannot.
 
 use std::time::{Duration, Instant};
 
@@ -15,12 +16,7 @@ const EIGHT: f64 = 8.0 * 1024.0 * 1024.0 / 8.0;
 
 /// What the flow may send to other layers, in bytes a second.
 async fn bandwidth(flow: &str) -> Option<f64> {
-    let metrics = reqwest::get(format!("http://{flow}/metrics"))
-        .await
-        .ok()?
-        .text()
-        .await
-        .ok()?;
+    let metrics = reqwest::get(format!("http://{flow}/metrics")).await.ok()?.text().await.ok()?;
     let is_it = |line: &&str| {
         let budget = line.strip_prefix("blaze_flow_budget_bytes_per_second{");
         budget.is_some_and(|rest| rest.contains("\"limit\"") && rest.contains("\"inter\""))
@@ -54,13 +50,7 @@ async fn is_configured(process: &Process, worker: &str) {
                 && row["hash"] == row["config_hash"]
         })
     };
-    until(
-        process,
-        "the flow is ready",
-        &format!("http://{worker}/v1/status"),
-        is_so,
-    )
-    .await;
+    until(process, "the flow is ready", &format!("http://{worker}/v1/status"), is_so).await;
 }
 
 /// Waits until the check `config` of the flow is as it should be; it stays ready.
@@ -98,10 +88,8 @@ async fn on_redis_it_lives_and_says_what_it_does_not_take() {
     is_configured(&process, &places["worker"]).await;
     let mut connection = plain::connect(redis).unwrap();
     let mut state = || {
-        let asked = redis::cmd("HGET")
-            .arg("blaze:watchdog:blaze-flow:dev-1:0")
-            .arg("state")
-            .to_owned();
+        let asked =
+            redis::cmd("HGET").arg("blaze:watchdog:blaze-flow:dev-1:0").arg("state").to_owned();
         asked.query::<Option<String>>(&mut connection).unwrap()
     };
     assert_eq!(state().as_deref(), Some("ready"), "it shows that it lives");
@@ -113,17 +101,15 @@ async fn on_redis_it_lives_and_says_what_it_does_not_take() {
     assert_eq!((&ack["status"], &ack["node"]), (&json!("applied"), &json!("dev-1")));
     assert_eq!(bandwidth(flow).await, Some(EIGHT));
     // At `warn`, with which it began, it would not say so.
-    let is_told = || {
-        process
-            .stderr()
-            .iter()
-            .any(|line| line.contains("configuration reloaded"))
-    };
+    let is_told = || process.stderr().iter().any(|line| line.contains("configuration reloaded"));
     wait::until("it logs more", PATIENCE, is_told, || process.tail()).unwrap();
     is_configured(&process, &places["worker"]).await;
 
     // With what is faulty comes a limit, which must not count either.
-    let faulty = json!({ "flow": { "bandwidth": { "limit_mbps": 7 } }, "log": { "level": "blaze_flow[=info" } });
+    let faulty = json!({
+        "flow": { "bandwidth": { "limit_mbps": 7 } },
+        "log": { "level": "blaze_flow[=info" },
+    });
     let revision = say(rest, &faulty).await;
     let ack = acknowledged(&mut acks, revision);
     assert_eq!(ack["status"], "rejected", "{ack}");
@@ -134,9 +120,12 @@ async fn on_redis_it_lives_and_says_what_it_does_not_take() {
     say(rest, &good).await;
     check(&process, flow, "ok", "").await;
     // No main service takes this; the flow looks at it all the same.
-    let notice = json!({ "service": "blaze-flow", "instance": "0", "layer": "edge", "node": "dev-1", "revision": 1_000_001,
-        "hash": "sha256:1000001", "paths": [], "scopes": [], "config": { "flow": { "bandwidth": { "limit_mbps": -1 } } }, "source": "main" });
-    plain::publish(redis, "blaze/config/changed/blaze-flow", notice.to_string().as_bytes()).unwrap();
+    let notice = json!({ "service": "blaze-flow", "instance": "0", "layer": "edge", "node": "dev-1",
+        "revision": 1_000_001,
+        "hash": "sha256:1000001", "paths": [], "scopes": [],
+        "config": { "flow": { "bandwidth": { "limit_mbps": -1 } } }, "source": "main" });
+    plain::publish(redis, "blaze/config/changed/blaze-flow", notice.to_string().as_bytes())
+        .unwrap();
     let ack = acknowledged(&mut acks, 1_000_001);
     assert_eq!(ack["status"], "rejected", "{ack}");
     check(&process, flow, "failed", "flow.bandwidth.limit_mbps").await;

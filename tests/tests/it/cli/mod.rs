@@ -1,4 +1,5 @@
-//! Commands of `blaze` that need more than one of our programs, as their users have them: real processes, real servers.
+//! Commands of `blaze` that need more than one of our programs, as their users have them: real
+//! processes, real servers.
 //!
 //! Needs `cargo build --workspace` and `scripts/services install` (Redis).
 

@@ -13,7 +13,8 @@ fn a_node_that_joins_has_a_node_file_with_which_its_worker_is_taken() {
     let main = stage.main_with_tokens();
     let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
     let join = format!(
-        "node join robot-1 --layer edge --type mobile --label site=lab --node-broker {} --grpc http://{} --state-dir {}",
+        "node join robot-1 --layer edge --type mobile --label site=lab --node-broker {} --grpc \
+         http://{} --state-dir {}",
         redis.url(),
         main.grpc,
         stage.path("state").display()
@@ -77,15 +78,9 @@ fn a_node_that_joins_has_a_node_file_with_which_its_worker_is_taken() {
     // Again: nothing changes, the token stays.
     let again = stage.blaze(&main, &join);
     assert_eq!((again.code, &again.stdout), (0, &joined.stdout), "{again:?}");
-    assert!(
-        again.stderr.contains("unchanged") && again.stderr.contains("--renew"),
-        "{again:?}"
-    );
+    assert!(again.stderr.contains("unchanged") && again.stderr.contains("--renew"), "{again:?}");
     assert_eq!(std::fs::read_to_string(stage.path("robot-1.token")).unwrap(), token);
-    assert_eq!(
-        stage.blaze(&main, "get node robot-1 -o json").json()["revision"],
-        node["revision"]
-    );
+    assert_eq!(stage.blaze(&main, "get node robot-1 -o json").json()["revision"], node["revision"]);
 
     let renewed = stage.blaze(&main, &format!("{join} --renew -o json"));
     assert_eq!(renewed.code, 0, "{renewed:?}");
@@ -103,10 +98,7 @@ fn a_node_that_joins_has_a_node_file_with_which_its_worker_is_taken() {
     );
     assert_eq!(there.code, 1, "{there:?}");
     assert!(there.stderr.contains("nothing was changed"), "{there:?}");
-    assert_eq!(
-        stage.blaze(&main, "get node robot-1 -o json").json()["spec"]["type"],
-        "mobile"
-    );
+    assert_eq!(stage.blaze(&main, "get node robot-1 -o json").json()["spec"]["type"], "mobile");
 
     // Another layer's token.
     let fog = stage.write("fog.yaml", "kind: Layer\nname: fog\nspec: { kind: fog }\n");
@@ -114,11 +106,7 @@ fn a_node_that_joins_has_a_node_file_with_which_its_worker_is_taken() {
     let foreign = stage.blaze(&main, "node join fog-1 --layer fog --token-out robot-1.token");
     assert_eq!(foreign.code, 7, "{foreign:?}");
     assert!(foreign.stderr.contains("for layer edge"), "{foreign:?}");
-    assert_eq!(
-        stage.blaze(&main, "get node fog-1").code,
-        4,
-        "what is refused changes nothing"
-    );
+    assert_eq!(stage.blaze(&main, "get node fog-1").code, 4, "what is refused changes nothing");
 }
 
 #[test]
@@ -141,21 +129,12 @@ fn a_server_that_signs_nothing_is_told_what_to_do_about_it() {
     assert_eq!(without.json()["node_file"]["config"].get("token_file"), None);
     let key = stage.path("own.key");
     let key = key.to_str().unwrap();
-    assert_eq!(
-        stage
-            .run("blaze", &["token", "keygen", "--alg", "EdDSA", "--out", key])
-            .code,
-        0
-    );
-    let signed = stage.blaze(
-        &main,
-        &format!("node join robot-1 --layer edge --key-file {key} --alg EdDSA"),
-    );
+    assert_eq!(stage.run("blaze", &["token", "keygen", "--alg", "EdDSA", "--out", key]).code, 0);
+    let signed =
+        stage.blaze(&main, &format!("node join robot-1 --layer edge --key-file {key} --alg EdDSA"));
     assert_eq!(signed.code, 0, "{signed:?}");
     assert_eq!(mode(&stage.path("robot-1.token")), 0o600);
-    let inspected = stage
-        .run("blaze", &["token", "inspect", "robot-1.token", "-o", "json"])
-        .json();
+    let inspected = stage.run("blaze", &["token", "inspect", "robot-1.token", "-o", "json"]).json();
     assert_eq!(inspected["claims"]["roles"], json!(["worker"]));
     assert_eq!(inspected["claims"]["layer"], "edge");
 }

@@ -37,9 +37,7 @@ pub(crate) struct Stage {
 
 impl Stage {
     pub(crate) fn new() -> Self {
-        Self {
-            folder: TempDir::new().unwrap(),
-        }
+        Self { folder: TempDir::new().unwrap() }
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
@@ -91,13 +89,12 @@ impl Stage {
     /// A main service that signs tokens, and one of an administrator.
     pub(crate) fn main_with_tokens(&self) -> Main {
         let key = self.path("jwt.key");
-        let made = self.run(
-            "blaze",
-            &["token", "keygen", "--alg", "HS256", "--out", key.to_str().unwrap()],
-        );
+        let made = self
+            .run("blaze", &["token", "keygen", "--alg", "HS256", "--out", key.to_str().unwrap()]);
         assert_eq!(made.code, 0, "{made:?}");
         let file = self
-            .main_file(&json!({ "auth": { "keys": [ { "id": "k1", "alg": "HS256", "file": key, "sign": true } ] } }));
+            .main_file(&json!({ "auth": { "keys": [ { "id": "k1", "alg": "HS256", "file": key,
+                "sign": true } ] } }));
         let line = "token create --subject root --role admin --alg HS256 --key-id k1 --key-file";
         let words: Vec<&str> = line.split_whitespace().chain([key.to_str().unwrap()]).collect();
         let token = self.run("blaze", &words);
@@ -108,13 +105,11 @@ impl Stage {
 
     fn main_file(&self, more: &Value) -> PathBuf {
         let mut section = json!({
-            "rest": { "listen": "127.0.0.1:0" }, "grpc": { "listen": "127.0.0.1:0" }, "admin": { "listen": "127.0.0.1:0" },
+            "rest": { "listen": "127.0.0.1:0" }, "grpc": { "listen": "127.0.0.1:0" },
+            "admin": { "listen": "127.0.0.1:0" },
             "store": { "sqlite": { "path": self.path("main.db") } },
         });
-        section
-            .as_object_mut()
-            .unwrap()
-            .extend(more.as_object().unwrap().clone());
+        section.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
         let file = json!({ "log": { "level": "warn" }, "control_plane": section });
         // JSON is YAML.
         self.write("main.yaml", &file.to_string())

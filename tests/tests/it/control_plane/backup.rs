@@ -1,5 +1,5 @@
-//! A backup is taken while many write, and restored elsewhere: the documents are those of its revision, and all watchers
-//! list again.
+//! A backup is taken while many write, and restored elsewhere: the documents are those of its
+//! revision, and all watchers list again.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -21,13 +21,8 @@ use super::writer::Writer;
 
 /// What a restored store's revision is higher by, as the contract has it.
 const RAISED_BY: u64 = 1_000_000;
-const KINDS: [v1::Kind; 5] = [
-    v1::Kind::Layer,
-    v1::Kind::Node,
-    v1::Kind::Service,
-    v1::Kind::Instance,
-    v1::Kind::Rollout,
-];
+const KINDS: [v1::Kind; 5] =
+    [v1::Kind::Layer, v1::Kind::Node, v1::Kind::Service, v1::Kind::Instance, v1::Kind::Rollout];
 const SECRET: &str = "kept-across-a-restore";
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -55,7 +50,8 @@ async fn restored_elsewhere(stage: Stage) {
             watchers.push(Watcher::start(vec![client.at(via, main)]).await);
         }
     }
-    let (file, revision, last) = within("the backup", limit, back_up(&stage, &mains, &client)).await;
+    let (file, revision, last) =
+        within("the backup", limit, back_up(&stage, &mains, &client)).await;
     assert!(revision < last, "{revision}: nobody wrote after the backup");
     for watcher in &mut watchers {
         within("the watchers", limit, watcher.catch_up(last)).await;
@@ -88,11 +84,7 @@ async fn restored_elsewhere(stage: Stage) {
     for (key, document) in &expected {
         assert_eq!(found[key], *document, "{key:?}");
     }
-    let secret = restored
-        .rest
-        .get(at, "/api/v1/services/with-secret?reveal=true")
-        .await
-        .unwrap();
+    let secret = restored.rest.get(at, "/api/v1/services/with-secret?reveal=true").await.unwrap();
     assert_eq!(
         secret.body.pointer("/spec/config/key/$secret/text"),
         Some(&json!(SECRET)),
@@ -124,16 +116,40 @@ async fn restored_elsewhere(stage: Stage) {
 /// Documents of all kinds that the layer sees.
 async fn prepare(client: &Client) {
     let documents = json!([
-        { "kind": "Layer", "name": "edge", "spec": { "kind": "edge", "config": { "log": { "level": "info" } } } },
-        { "kind": "Node", "name": "robot-1", "labels": { "canary": "true" }, "spec": { "layer": "edge" } },
-        { "kind": "Service", "name": "with-secret", "spec": { "config": { "key": { "$secret": SECRET } } } },
-        { "kind": "Instance", "service": "with-secret", "name": "0", "spec": { "node": "robot-1", "config": { "a": 1 } } },
+        {
+            "kind": "Layer",
+            "name": "edge",
+            "spec": { "kind": "edge", "config": { "log": { "level": "info" } } },
+        },
+        {
+            "kind": "Node",
+            "name": "robot-1",
+            "labels": { "canary": "true" },
+            "spec": { "layer": "edge" },
+        },
+        {
+            "kind": "Service",
+            "name": "with-secret",
+            "spec": { "config": { "key": { "$secret": SECRET } } },
+        },
+        {
+            "kind": "Instance",
+            "service": "with-secret",
+            "name": "0",
+            "spec": { "node": "robot-1", "config": { "a": 1 } },
+        },
     ]);
     let at = client.main.at().rest;
     client.rest.post(at, "/api/v1/apply", &documents).await;
     let rollout = json!({ "name": "slower", "spec": {
-        "target": { "kind": "Service", "name": "with-secret" }, "patch": { "config": { "rate": 1 } },
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        "target": {
+            "kind": "Service",
+            "name": "with-secret",
+        }, "patch": { "config": { "rate": 1 } },
+        "canary": { "node_selector": "canary=true" }, "gate": {
+            "window_s": 60,
+            "max_unhealthy": 0,
+        },
     } });
     client.rest.post(at, "/api/v1/rollouts", &rollout).await;
 }
@@ -184,10 +200,7 @@ async fn back_up(stage: &Arc<Stage>, mains: &[Arc<Main>], client: &Client) -> (P
     over.store(true, Ordering::Release);
     writing.join_all().await;
     let revision: u64 = word_after(&said, "revision ").parse().unwrap();
-    println!(
-        "{} (writers had been told {before} before it and {after} after it)",
-        said.trim()
-    );
+    println!("{} (writers had been told {before} before it and {after} after it)", said.trim());
     // A commit of each writer may be in the backup before that one hears of it.
     assert!(
         (before..=after + 4).contains(&revision) && after > before,
@@ -197,9 +210,8 @@ async fn back_up(stage: &Arc<Stage>, mains: &[Arc<Main>], client: &Client) -> (P
 }
 
 fn word_after<'a>(text: &'a str, before: &str) -> &'a str {
-    let (_, rest) = text
-        .split_once(before)
-        .unwrap_or_else(|| panic!("{before:?} is not in {text}"));
+    let (_, rest) =
+        text.split_once(before).unwrap_or_else(|| panic!("{before:?} is not in {text}"));
     rest.split([' ', ':']).next().unwrap()
 }
 
@@ -210,8 +222,12 @@ async fn store_of(stage: &Arc<Stage>) -> String {
     word_after(&said, "of store ").to_owned()
 }
 
-/// Every document with all that it has, by kind, service and name; as it was at a revision, or as it is.
-async fn documents(client: &Client, revision: Option<u64>) -> BTreeMap<(i32, String, String), v1::Document> {
+/// Every document with all that it has, by kind, service and name; as it was at a revision, or as
+/// it is.
+async fn documents(
+    client: &Client,
+    revision: Option<u64>,
+) -> BTreeMap<(i32, String, String), v1::Document> {
     let client = client.at(Via::Grpc, &client.main);
     let mut grpc = client.grpc().await.unwrap();
     let mut all = BTreeMap::new();
@@ -220,10 +236,7 @@ async fn documents(client: &Client, revision: Option<u64>) -> BTreeMap<(i32, Str
         loop {
             let request = v1::ListRequest {
                 kind: kind.into(),
-                page: Some(v1::Page {
-                    limit: 100,
-                    page_token: page_token.clone(),
-                }),
+                page: Some(v1::Page { limit: 100, page_token: page_token.clone() }),
                 read: Some(v1::ReadOptions {
                     at_revision: revision.unwrap_or(0),
                     ..v1::ReadOptions::default()

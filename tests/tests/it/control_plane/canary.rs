@@ -1,5 +1,5 @@
-//! Secrets are put, changed, brought back, compared, watched, refused and backed up. Their texts are given out to who asks
-//! for them and may have them, and are nowhere else.
+//! Secrets are put, changed, brought back, compared, watched, refused and backed up. Their texts
+//! are given out to who asks for them and may have them, and are nowhere else.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -35,7 +35,8 @@ fn text(number: u32) -> String {
 
 /// A spec with a secret deep in its configuration, and in a list.
 fn spec(number: u32) -> Value {
-    json!({ "config": { "plain": PLAIN, "db": { "password": secret(number) }, "list": [{ "key": secret(number + 1) }] } })
+    json!({ "config": { "plain": PLAIN, "db": { "password": secret(number) },
+        "list": [{ "key": secret(number + 1) }] } })
 }
 
 /// Fails where a secret is found, also as a plain encoding of it.
@@ -82,16 +83,18 @@ impl World {
         }
     }
 
-    async fn ask(&self, rest: &Rest, method: &str, path: &str, headers: Headers<'_>, body: Option<&Value>) -> Answer {
-        let headers: Vec<(&str, String)> = headers
-            .iter()
-            .map(|(name, value)| (*name, (*value).to_owned()))
-            .collect();
+    async fn ask(
+        &self,
+        rest: &Rest,
+        method: &str,
+        path: &str,
+        headers: Headers<'_>,
+        body: Option<&Value>,
+    ) -> Answer {
+        let headers: Vec<(&str, String)> =
+            headers.iter().map(|(name, value)| (*name, (*value).to_owned())).collect();
         let at = self.main.at().rest;
-        let answer = rest
-            .send(at, method.parse().unwrap(), path, &headers, body)
-            .await
-            .unwrap();
+        let answer = rest.send(at, method.parse().unwrap(), path, &headers, body).await.unwrap();
         clean(&format!("{method} {path}"), &answer.text);
         answer
     }
@@ -104,7 +107,13 @@ impl World {
     }
 
     /// A change that must be refused for what it says.
-    async fn refused(&self, method: &str, path: &str, headers: Headers<'_>, body: &Value) -> Answer {
+    async fn refused(
+        &self,
+        method: &str,
+        path: &str,
+        headers: Headers<'_>,
+        body: &Value,
+    ) -> Answer {
         let answer = self.ask(&self.rest, method, path, headers, Some(body)).await;
         assert_eq!(answer.status, 422, "{path}: {}", answer.text);
         answer
@@ -119,11 +128,8 @@ impl World {
     /// The status of a request of raw bytes, as who makes mistakes sends it.
     async fn send(&self, method: &str, path: &str, media: &str, body: String) -> u16 {
         let url = format!("http://{}{path}", self.main.at().rest);
-        let request = self
-            .rest
-            .http
-            .request(method.parse().unwrap(), url)
-            .bearer_auth(&self.rest.token);
+        let request =
+            self.rest.http.request(method.parse().unwrap(), url).bearer_auth(&self.rest.token);
         let request = request.header("content-type", media).header("if-match", "*").body(body);
         let response = request.send().await.unwrap();
         let status = response.status().as_u16();
@@ -166,9 +172,7 @@ async fn a_secret_is_nowhere_on_mongodb() {
 
 /// Looks into every collection; these hold what stands beside the secrets.
 fn holds_no_secret(stage: &Stage, plain: &[&str]) {
-    let Store::Mongo { server, database } = &stage.store else {
-        panic!("it is MongoDB")
-    };
+    let Store::Mongo { server, database } = &stage.store else { panic!("it is MongoDB") };
     let ask = |command: &Value| mongo_command(&server.uri(), database, command).unwrap();
     let tables = ask(&json!({ "listCollections": 1, "cursor": { "batchSize": 1000 } }));
     let mut found = BTreeSet::new();
@@ -201,7 +205,8 @@ async fn everything(world: &World) {
     revealed(world).await;
 }
 
-/// Backs up while it runs, waits until all is logged, and kills it: what is in the files stays as it is.
+/// Backs up while it runs, waits until all is logged, and kills it: what is in the files stays as
+/// it is.
 async fn end(stage: &Arc<Stage>, world: &World) {
     let (_, metrics) = world.main.admin().get("/metrics").unwrap();
     clean("metrics", &metrics);
@@ -213,9 +218,7 @@ async fn end(stage: &Arc<Stage>, world: &World) {
     assert!(read_file(&file).contains(PLAIN));
     // Its line is behind those of all that was asked before.
     let mark = "the-last-request";
-    world
-        .ask(&world.rest, "GET", "/api/v1/nodes", &[("x-request-id", mark)], None)
-        .await;
+    world.ask(&world.rest, "GET", "/api/v1/nodes", &[("x-request-id", mark)], None).await;
     let log = world.log.clone();
     blocking(move || {
         wait::until(
@@ -238,20 +241,16 @@ async fn end(stage: &Arc<Stage>, world: &World) {
     blocking(move || main.kill()).await;
 }
 
-/// Secrets in documents of every kind that can have them, by every way of REST. The revision of the first.
+/// Secrets in documents of every kind that can have them, by every way of REST. The revision of the
+/// first.
 async fn written(world: &World) -> u64 {
     let slam = "/api/v1/services/slam";
     let edge = json!({ "name": "edge", "spec": { "kind": "edge" } });
-    let begin = world
-        .write("POST", "/api/v1/layers", NONE, &edge)
-        .await
-        .revision
-        .unwrap();
+    let begin = world.write("POST", "/api/v1/layers", NONE, &edge).await.revision.unwrap();
     let body = json!({ "name": "slam", "spec": spec(10) });
     for replayed in [false, true] {
-        let answer = world
-            .write("POST", "/api/v1/services", &[("idempotency-key", "once")], &body)
-            .await;
+        let answer =
+            world.write("POST", "/api/v1/services", &[("idempotency-key", "once")], &body).await;
         assert!(answer.text.contains("redacted"), "{replayed}: {}", answer.text);
     }
     let part = |number: u32| spec(number)["config"].clone();
@@ -261,19 +260,9 @@ async fn written(world: &World) -> u64 {
     for (method, path, headers, body) in [
         ("PUT", "/api/v1/layers/edge", ANY, json!({ "spec": layer })),
         ("POST", "/api/v1/nodes", NONE, json!({ "name": "robot", "spec": node })),
-        (
-            "POST",
-            "/api/v1/services/slam/instances",
-            NONE,
-            json!({ "name": "0", "spec": instance }),
-        ),
+        ("POST", "/api/v1/services/slam/instances", NONE, json!({ "name": "0", "spec": instance })),
         ("PUT", slam, ANY, json!({ "spec": spec(30) })),
-        (
-            "PATCH",
-            slam,
-            ANY,
-            json!({ "spec": { "config": { "db": { "password": secret(32) } } } }),
-        ),
+        ("PATCH", slam, ANY, json!({ "spec": { "config": { "db": { "password": secret(32) } } } })),
     ] {
         world.write(method, path, headers, &body).await;
     }
@@ -286,9 +275,7 @@ async fn written(world: &World) -> u64 {
         { "kind": "Service", "name": "map", "spec": spec(42) },
     ]);
     for path in ["/api/v1/apply?dry_run=true", "/api/v1/apply"] {
-        let answer = world
-            .write("POST", path, &[("idempotency-key", "apply")], &documents)
-            .await;
+        let answer = world.write("POST", path, &[("idempotency-key", "apply")], &documents).await;
         assert!(answer.text.contains("/spec/config/db/password"), "{}", answer.text);
     }
     let yaml = format!(
@@ -299,20 +286,10 @@ async fn written(world: &World) -> u64 {
     let last = &world.read("/api/v1/services/map").await.body["revision"];
     // Brought back, taken back, gone, and back from what it was.
     for (method, path, headers, body) in [
-        (
-            "POST",
-            "/api/v1/services/slam/rollback",
-            NONE,
-            json!({ "revision": begin + 1 }),
-        ),
+        ("POST", "/api/v1/services/slam/rollback", NONE, json!({ "revision": begin + 1 })),
         ("POST", "/api/v1/revert", NONE, json!({ "revision": last })),
         ("DELETE", "/api/v1/services/map", ANY, Value::Null),
-        (
-            "POST",
-            "/api/v1/services/map/rollback",
-            NONE,
-            json!({ "revision": last }),
-        ),
+        ("POST", "/api/v1/services/map/rollback", NONE, json!({ "revision": last })),
     ] {
         world.write(method, path, headers, &body).await;
     }
@@ -377,15 +354,15 @@ async fn refused(world: &World) {
         (json!({ "closed": { "x": secret(111) } }), mismatch),
         (json!({ "a": { "$secret": text(112), "b": 1 } }), invalid),
         (json!({ "a": { "$secret": [text(113)] } }), invalid),
-        (
-            json!({ "a": { "$secret": { "text": text(114), "version": "x" } } }),
-            invalid,
-        ),
+        (json!({ "a": { "$secret": { "text": text(114), "version": "x" } } }), invalid),
         (json!({ "a": { "$secret": sealed } }), invalid),
         (secret(116), invalid),
         (json!({ "worker": { "lease_ms": secret(117) } }), invalid),
         (
-            json!({ "unknown": { "$secret": { "redacted": true, "version": 1 } }, "a": secret(118) }),
+            json!({
+                "unknown": { "$secret": { "redacted": true, "version": 1 } },
+                "a": secret(118),
+            }),
             "secret_unknown",
         ),
     ] {
@@ -407,7 +384,11 @@ async fn refused(world: &World) {
     ] {
         world.refused("PUT", service, ANY, &body).await;
     }
-    let patch = json!({ "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "a": secret(126) } }, "canary": { "node_selector": "a" } });
+    let patch = json!({
+        "target": { "kind": "Service", "name": "slam" },
+        "patch": { "config": { "a": secret(126) } },
+        "canary": { "node_selector": "a" },
+    });
     let rollout = json!({ "name": "r", "spec": patch });
     world.refused("POST", "/api/v1/rollouts", NONE, &rollout).await;
     let good = json!({ "spec": spec(130) });
@@ -423,8 +404,12 @@ async fn refused(world: &World) {
     let text = text(140);
     for body in [
         format!("{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\""),
-        format!("{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\",\"$secret\":\"{text}\"}}}}}}}}"),
-        format!("{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\"}},\"n\":9007199254740993}}}}}}"),
+        format!(
+            "{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\",\"$secret\":\"{text}\"}}}}}}}}"
+        ),
+        format!(
+            "{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\"}},\"n\":9007199254740993}}}}}}"
+        ),
         format!("{{\"spec\": {text}}}"),
     ] {
         assert_eq!(world.send("PUT", service, "application/json", body).await, 400);
@@ -432,15 +417,20 @@ async fn refused(world: &World) {
     assert_eq!(world.send("PUT", service, "text/plain", good.to_string()).await, 415);
     for yaml in [
         format!("kind: Service\nname: x\nspec: {{ config: {{ a: {{ $secret: {text} }} }}"),
-        format!("kind: Service\nname: x\nspec: {{ config: {{ a: {{ $secret: &anchor {text} }} }} }}\n"),
-        format!("kind: Service\nname: x\nspec:\n  config:\n    a: {{ $secret: {text} }}\n   b: 1\n"),
+        format!(
+            "kind: Service\nname: x\nspec: {{ config: {{ a: {{ $secret: &anchor {text} }} }} }}\n"
+        ),
+        format!(
+            "kind: Service\nname: x\nspec:\n  config:\n    a: {{ $secret: {text} }}\n   b: 1\n"
+        ),
         format!("kind: Service\nname: x\nspec: {{ config: {{ a: !tag {text} }} }}\n"),
         format!("a: {text}\na: {text}\n"),
         format!("kind: Service\n  a: [{text}"),
     ] {
         assert_eq!(world.send("POST", "/api/v1/apply", "application/yaml", yaml).await, 400);
     }
-    let too_long = json!({ "spec": { "config": { "a": { "$secret": format!("{text}{}", "x".repeat(300 * 1024)) } } } });
+    let too_long = json!({ "spec": { "config": { "a": { "$secret": format!("{text}{}",
+        "x".repeat(300 * 1024)) } } } });
     let answer = world.ask(&world.rest, "PUT", service, ANY, Some(&too_long)).await;
     assert!([413, 422].contains(&answer.status), "{}", answer.text);
     let revealed = "/api/v1/services/slam?reveal=true";
@@ -461,7 +451,8 @@ async fn read(world: &World, begin: u64) {
     ] {
         let shown = world.read(&format!("/api/v1/{name}")).await;
         assert!(
-            shown.text.contains("redacted") && (name == "services/map" || shown.text.contains(PLAIN)),
+            shown.text.contains("redacted")
+                && (name == "services/map" || shown.text.contains(PLAIN)),
             "{}",
             shown.text
         );
@@ -472,13 +463,9 @@ async fn read(world: &World, begin: u64) {
             let (revision, op) = (entry["revision"].as_u64().unwrap(), &entry["op"]);
             if op != "delete" {
                 world.read(&format!("/api/v1/{name}?revision={revision}")).await;
-                world
-                    .read(&format!("/api/v1/{name}/diff?from={begin}&to={revision}"))
-                    .await;
+                world.read(&format!("/api/v1/{name}/diff?from={begin}&to={revision}")).await;
             }
-            let diff = world
-                .read(&format!("/api/v1/{name}/diff?from={revision}&to={head}"))
-                .await;
+            let diff = world.read(&format!("/api/v1/{name}/diff?from={revision}&to={head}")).await;
             assert!(diff.body["changes"].is_array());
         }
     }
@@ -499,15 +486,9 @@ async fn read(world: &World, begin: u64) {
     ] {
         world.read(&format!("/api/v1/{path}")).await;
     }
-    let explain = world
-        .read("/api/v1/effective?service=slam&instance=0&explain=true")
-        .await;
+    let explain = world.read("/api/v1/effective?service=slam&instance=0&explain=true").await;
     assert!(
-        explain.body["explain"]["/db/password"]["overridden"]
-            .as_array()
-            .unwrap()
-            .len()
-            > 2,
+        explain.body["explain"]["/db/password"]["overridden"].as_array().unwrap().len() > 2,
         "{}",
         explain.text
     );
@@ -551,11 +532,8 @@ async fn revealed(world: &World) {
         "{}",
         slam.status
     );
-    let instance = world
-        .rest
-        .get(at, "/api/v1/effective?service=slam&instance=0&reveal=true")
-        .await
-        .unwrap();
+    let instance =
+        world.rest.get(at, "/api/v1/effective?service=slam&instance=0&reveal=true").await.unwrap();
     assert_eq!(
         instance.body.pointer("/config/list/0/key/$secret/text"),
         Some(&json!(text(29))),

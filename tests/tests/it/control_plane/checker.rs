@@ -1,6 +1,7 @@
-//! Whether a history of one register can be explained: by an order of its operations in which each answer is right, and
-//! no operation stands before one that had been answered when it began (Herlihy, Wing). The search is that of Wing and
-//! Gong; what was tried in vain is remembered (Lowe), and its length is bounded.
+//! Whether a history of one register can be explained: by an order of its operations in which each
+//! answer is right, and no operation stands before one that had been answered when it began
+//! (Herlihy, Wing). The search is that of Wing and Gong; what was tried in vain is remembered
+//! (Lowe), and its length is bounded.
 
 use std::collections::HashSet;
 
@@ -34,7 +35,8 @@ pub(crate) fn check(history: &[Event], limit: usize) -> Verdict {
         };
         // The last one pushed is looked at first: the one that began first.
         let candidates = events.iter().enumerate().take_while(|(_, event)| event.begin <= bound);
-        let candidates: Vec<(usize, &Event)> = candidates.filter(|(index, _)| !has(&placed, *index)).collect();
+        let candidates: Vec<(usize, &Event)> =
+            candidates.filter(|(index, _)| !has(&placed, *index)).collect();
         for (index, event) in candidates.into_iter().rev() {
             let Some(after) = event.on(state) else { continue };
             let mut next = placed.clone();
@@ -53,8 +55,8 @@ pub(crate) fn check(history: &[Event], limit: usize) -> Verdict {
     Verdict::Impossible
 }
 
-/// When the first of the operations that must still be placed was answered; `None` when all are. What is unknown need not
-/// be placed: then it never took effect.
+/// When the first of the operations that must still be placed was answered; `None` when all are.
+/// What is unknown need not be placed: then it never took effect.
 fn first_answer(events: &[Event], placed: &[u64]) -> Option<u64> {
     let left = events
         .iter()
@@ -77,12 +79,7 @@ mod tests {
     const LIMIT: usize = 100_000;
 
     fn event(begin: u64, end: u64, op: Op, outcome: Outcome) -> Event {
-        Event {
-            op,
-            outcome,
-            begin,
-            end,
-        }
+        Event { op, outcome, begin, end }
     }
 
     fn unknown(begin: u64, op: Op) -> Event {
@@ -155,10 +152,8 @@ mod tests {
 
     #[test]
     fn a_lost_write_is_rejected() {
-        let history = [
-            event(1, 2, Op::Create(1), Outcome::Done),
-            event(3, 4, Op::Get, Outcome::Found(None)),
-        ];
+        let history =
+            [event(1, 2, Op::Create(1), Outcome::Done), event(3, 4, Op::Get, Outcome::Found(None))];
         assert_eq!(verdict(&history), Verdict::Impossible);
     }
 
@@ -167,24 +162,12 @@ mod tests {
         let swap = unknown(3, Op::Swap { seen: 1, new: 2 });
         let create = event(1, 2, Op::Create(1), Outcome::Done);
         let found = |time, content| event(time, time + 1, Op::Get, Outcome::Found(Some(content)));
-        assert_eq!(
-            verdict(&[create, swap, found(5, 1), found(7, 1)]),
-            Verdict::Linearizable
-        );
-        assert_eq!(
-            verdict(&[create, swap, found(5, 2), found(7, 2)]),
-            Verdict::Linearizable
-        );
+        assert_eq!(verdict(&[create, swap, found(5, 1), found(7, 1)]), Verdict::Linearizable);
+        assert_eq!(verdict(&[create, swap, found(5, 2), found(7, 2)]), Verdict::Linearizable);
         // Late, but it did.
-        assert_eq!(
-            verdict(&[create, swap, found(5, 1), found(7, 2)]),
-            Verdict::Linearizable
-        );
+        assert_eq!(verdict(&[create, swap, found(5, 1), found(7, 2)]), Verdict::Linearizable);
         assert_eq!(verdict(&[create, swap, found(5, 2), found(7, 1)]), Verdict::Impossible);
-        assert_eq!(
-            verdict(&[create, unknown(9, Op::Create(7)), found(5, 7)]),
-            Verdict::Impossible
-        );
+        assert_eq!(verdict(&[create, unknown(9, Op::Create(7)), found(5, 7)]), Verdict::Impossible);
     }
 
     #[test]
@@ -218,35 +201,20 @@ mod tests {
                     0 => Op::Create(new),
                     1 => Op::Get,
                     2 => Op::Swap { seen, new },
-                    _ => Op::Delete {
-                        seen: (guess > 1).then_some(seen),
-                    },
+                    _ => Op::Delete { seen: (guess > 1).then_some(seen) },
                 };
-                let done = Event {
-                    op,
-                    outcome: Outcome::Done,
-                    begin: point - before,
-                    end: point + after,
-                };
+                let done =
+                    Event { op, outcome: Outcome::Done, begin: point - before, end: point + after };
                 let event = match op {
-                    Op::Get => Event {
-                        outcome: Outcome::Found(state),
-                        ..done
-                    },
+                    Op::Get => Event { outcome: Outcome::Found(state), ..done },
                     Op::Create(_) | Op::Swap { .. } | Op::Delete { .. } => match done.on(state) {
                         Some(next) => {
                             state = next;
-                            let unknown = Event {
-                                outcome: Outcome::Unknown,
-                                end: u64::MAX,
-                                ..done
-                            };
+                            let unknown =
+                                Event { outcome: Outcome::Unknown, end: u64::MAX, ..done };
                             if lost && guess == 3 { unknown } else { done }
                         }
-                        None => Event {
-                            outcome: Outcome::Refused,
-                            ..done
-                        },
+                        None => Event { outcome: Outcome::Refused, ..done },
                     },
                 };
                 events.push(event);

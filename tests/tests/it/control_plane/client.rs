@@ -64,22 +64,13 @@ pub(crate) struct Client {
 
 impl Client {
     pub(crate) fn new(via: Via, main: &Arc<Main>, token: &str) -> Self {
-        Self {
-            via,
-            main: Arc::clone(main),
-            rest: Rest::new(token),
-            grpc: Arc::default(),
-        }
+        Self { via, main: Arc::clone(main), rest: Rest::new(token), grpc: Arc::default() }
     }
 
-    /// The same user at the same or another process, by the same or another interface. gRPC has a connection of its own.
+    /// The same user at the same or another process, by the same or another interface. gRPC has a
+    /// connection of its own.
     pub(crate) fn at(&self, via: Via, main: &Arc<Main>) -> Self {
-        Self {
-            via,
-            main: Arc::clone(main),
-            rest: self.rest.clone(),
-            grpc: Arc::default(),
-        }
+        Self { via, main: Arc::clone(main), rest: self.rest.clone(), grpc: Arc::default() }
     }
 
     /// The same user with other connections of REST.
@@ -143,11 +134,16 @@ impl Client {
     pub(crate) async fn apply(&self, documents: &[(String, Value)]) -> Told {
         match self.via {
             Via::Rest => {
-                let one = |(name, config): &(String, Value)| json!({ "kind": "Service", "name": name, "spec": { "config": config } });
+                let one = |(name, config): &(String, Value)| {
+                    json!({
+                        "kind": "Service",
+                        "name": name,
+                        "spec": { "config": config },
+                    })
+                };
                 let body = Value::Array(documents.iter().map(one).collect());
-                let answer = self
-                    .send(Method::POST, "/api/v1/apply", Must::Nothing, Some(&body))
-                    .await;
+                let answer =
+                    self.send(Method::POST, "/api/v1/apply", Must::Nothing, Some(&body)).await;
                 told(answer, |answer| answer.body["revision"].as_u64())
             }
             Via::Grpc => {
@@ -188,10 +184,7 @@ impl Client {
                 }
             }
             Via::Grpc => {
-                let request = v1::GetRequest {
-                    r#ref: Some(reference(name)),
-                    read: None,
-                };
+                let request = v1::GetRequest { r#ref: Some(reference(name)), read: None };
                 match self.grpc().await?.get(self.signed(request)).await {
                     Ok(document) => {
                         let document = document.into_inner();
@@ -233,7 +226,13 @@ impl Client {
         request
     }
 
-    async fn send(&self, method: Method, path: &str, must: Must, body: Option<&Value>) -> Result<Answer, Lost> {
+    async fn send(
+        &self,
+        method: Method,
+        path: &str,
+        must: Must,
+        body: Option<&Value>,
+    ) -> Result<Answer, Lost> {
         let header = match must {
             Must::Nothing => None,
             Must::BeAbsent => Some(("if-none-match", "*".to_owned())),
@@ -246,11 +245,7 @@ impl Client {
 }
 
 fn reference(name: &str) -> v1::Ref {
-    v1::Ref {
-        kind: v1::Kind::Service.into(),
-        name: name.to_owned(),
-        service: String::new(),
-    }
+    v1::Ref { kind: v1::Kind::Service.into(), name: name.to_owned(), service: String::new() }
 }
 
 fn service(name: &str, config: &Value) -> v1::Document {
@@ -298,7 +293,10 @@ fn told_grpc(answer: Result<u64, tonic::Status>) -> Told {
     let member = |name: &str| info.metadata.get(name).cloned().unwrap_or_default();
     let of_server = matches!(
         status.code(),
-        tonic::Code::Unavailable | tonic::Code::Unknown | tonic::Code::Internal | tonic::Code::DeadlineExceeded
+        tonic::Code::Unavailable
+            | tonic::Code::Unknown
+            | tonic::Code::Internal
+            | tonic::Code::DeadlineExceeded
     );
     of_refusal(&member("code"), &member("applied"), of_server, &status.to_string())
 }
@@ -348,18 +346,12 @@ pub(crate) struct Rest {
 impl Rest {
     pub(crate) fn new(token: &str) -> Self {
         let http = reqwest::Client::builder().no_proxy().timeout(PATIENCE).build().unwrap();
-        Self {
-            http,
-            token: token.to_owned(),
-        }
+        Self { http, token: token.to_owned() }
     }
 
     /// The same connections with another token.
     pub(crate) fn with_token(&self, token: &str) -> Self {
-        Self {
-            http: self.http.clone(),
-            token: token.to_owned(),
-        }
+        Self { http: self.http.clone(), token: token.to_owned() }
     }
 
     pub(crate) async fn send(
@@ -390,12 +382,7 @@ impl Rest {
         let status = response.status().as_u16();
         // Half an answer is none: what it said is not known.
         let text = response.text().await.map_err(lost)?;
-        Ok(Answer {
-            status,
-            revision,
-            body: serde_json::from_str(&text).unwrap_or_default(),
-            text,
-        })
+        Ok(Answer { status, revision, body: serde_json::from_str(&text).unwrap_or_default(), text })
     }
 
     pub(crate) async fn get(&self, at: SocketAddr, path: &str) -> Result<Answer, Lost> {
@@ -412,19 +399,19 @@ impl Rest {
     /// `PUT` whatever there is, and nothing but success.
     pub(crate) async fn put(&self, at: SocketAddr, path: &str, body: &Value) -> Answer {
         let there = self.get(at, path).await.unwrap().status == 200;
-        let headers = if there {
-            vec![("if-match", "*".to_owned())]
-        } else {
-            Vec::new()
-        };
+        let headers = if there { vec![("if-match", "*".to_owned())] } else { Vec::new() };
         let answer = self.send(at, Method::PUT, path, &headers, Some(body)).await.unwrap();
         assert!(answer.status < 300, "PUT {path}: {} {}", answer.status, answer.text);
         answer
     }
 
-    /// Every document of a collection, and the revision that the list shows. `None` when its pages were trimmed away
-    /// while it was read.
-    pub(crate) async fn try_list(&self, at: SocketAddr, collection: &str) -> Option<(u64, Vec<Value>)> {
+    /// Every document of a collection, and the revision that the list shows. `None` when its pages
+    /// were trimmed away while it was read.
+    pub(crate) async fn try_list(
+        &self,
+        at: SocketAddr,
+        collection: &str,
+    ) -> Option<(u64, Vec<Value>)> {
         match self.try_pages(at, &format!("/api/v1/{collection}")).await {
             Ok(list) => Some(list),
             Err(answer) => {

@@ -1,5 +1,6 @@
-//! Processes and their store are killed, or replaced as an upgrade does it, while many write. What each writer was told is true: what took effect is there, once
-//! and whole; what did not is nowhere; of what nobody knows it is one or the other, whole.
+//! Processes and their store are killed, or replaced as an upgrade does it, while many write. What
+//! each writer was told is true: what took effect is there, once and whole; what did not is
+//! nowhere; of what nobody knows it is one or the other, whole.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -68,18 +69,21 @@ async fn what_writers_are_told_is_true_while_the_service_on_sqlite_is_killed() {
 async fn what_writers_are_told_is_true_while_two_services_and_mongodb_go_and_come() {
     let stage = Arc::new(Stage::mongo());
     let mains = vec![stage.start("one"), stage.start("two")];
-    let each = |index: usize| [Victim::Process(index % 2), Victim::Store, Victim::Replaced(index % 2)];
+    let each =
+        |index: usize| [Victim::Process(index % 2), Victim::Store, Victim::Replaced(index % 2)];
     let victims = (0..count(10, 2)).flat_map(each).collect();
     told_the_truth(&stage, &mains, victims, count(20_000, 400)).await;
 }
 
-async fn told_the_truth(stage: &Arc<Stage>, mains: &[Arc<Main>], victims: Vec<Victim>, goal: usize) {
+async fn told_the_truth(
+    stage: &Arc<Stage>,
+    mains: &[Arc<Main>],
+    victims: Vec<Victim>,
+    goal: usize,
+) {
     let limit = Duration::from_secs(if blaze_tests::long() { 1800 } else { 120 });
     let client = Client::new(Via::Rest, &mains[0], &stage.admin_token());
-    let progress = Arc::new(Progress {
-        yes: AtomicUsize::new(0),
-        goal,
-    });
+    let progress = Arc::new(Progress { yes: AtomicUsize::new(0), goal });
     let begin = Instant::now();
     let mut writers = JoinSet::new();
     for index in 0..WRITERS {
@@ -93,11 +97,8 @@ async fn told_the_truth(stage: &Arc<Stage>, mains: &[Arc<Main>], victims: Vec<Vi
         blocking(move || kill_all(&stage, &mains, &victims, &progress))
     };
     within("the kills", limit, killing).await;
-    let attempts: Vec<Attempt> = within("the writers", limit, writers.join_all())
-        .await
-        .into_iter()
-        .flatten()
-        .collect();
+    let attempts: Vec<Attempt> =
+        within("the writers", limit, writers.join_all()).await.into_iter().flatten().collect();
     let of = |one: fn(&Told) -> bool| attempts.iter().filter(|attempt| one(&attempt.told)).count();
     println!(
         "{} writes and {kills} kills in {:?}: yes {}, no {}, unknown {}",
@@ -111,11 +112,7 @@ async fn told_the_truth(stage: &Arc<Stage>, mains: &[Arc<Main>], victims: Vec<Vi
     check(&attempts, &history);
     for main in mains {
         let (_, items) = client.rest.list(main.at().rest, "services").await;
-        assert_eq!(
-            state_of(&items),
-            folded(&history),
-            "the documents are those of the history"
-        );
+        assert_eq!(state_of(&items), folded(&history), "the documents are those of the history");
     }
     audited(&client, &history).await;
 }
@@ -155,19 +152,15 @@ async fn write(client: Client, number: usize, progress: Arc<Progress>) -> Vec<At
     while progress.yes() < progress.goal {
         let count = attempts.len();
         let batch = format!("{number}-{count}");
-        let is_made = attempts
-            .iter()
-            .any(|attempt: &Attempt| matches!(attempt.told, Told::Yes(_)));
+        let is_made = attempts.iter().any(|attempt: &Attempt| matches!(attempt.told, Told::Yes(_)));
         // The first one that took effect has made all of them.
         let (names, told) = if !is_made || count.is_multiple_of(APPLY) {
-            let documents: Vec<(String, Value)> = names.iter().map(|name| (name.clone(), content(&batch))).collect();
+            let documents: Vec<(String, Value)> =
+                names.iter().map(|name| (name.clone(), content(&batch))).collect();
             (names.clone(), client.apply(&documents).await)
         } else {
             let name = &names[count % DOCUMENTS];
-            (
-                vec![name.clone()],
-                client.put(name, &content(&batch), Must::BeThere).await,
-            )
+            (vec![name.clone()], client.put(name, &content(&batch), Must::BeThere).await)
         };
         if let Told::Yes(_) = told {
             progress.yes.fetch_add(1, Ordering::AcqRel);
@@ -187,9 +180,7 @@ fn content(batch: &str) -> Value {
 /// Every commit there ever was.
 async fn history(client: &Client) -> Vec<Commit> {
     let head = client.rest.list(client.main.at().rest, "services").await.0;
-    let mut stream = Stream::open(client, 0)
-        .await
-        .unwrap_or_else(|refused| panic!("{refused:?}"));
+    let mut stream = Stream::open(client, 0).await.unwrap_or_else(|refused| panic!("{refused:?}"));
     let commits = stream.until(head).await.unwrap_or_else(|other| panic!("{other:?}"));
     let revisions: Vec<u64> = commits.iter().map(|commit| commit.revision).collect();
     assert_eq!(revisions, (1..=head).collect::<Vec<u64>>(), "no revision is missing");
@@ -201,10 +192,7 @@ fn check(attempts: &[Attempt], history: &[Commit]) {
     let mut found: BTreeMap<&str, Vec<(u64, Vec<&str>)>> = BTreeMap::new();
     for commit in history {
         let batch = commit.changes[0].config["batch"].as_str().unwrap();
-        assert!(
-            commit.changes.iter().all(|change| change.config["batch"] == batch),
-            "{commit:?}"
-        );
+        assert!(commit.changes.iter().all(|change| change.config["batch"] == batch), "{commit:?}");
         assert!(
             commit.changes.iter().all(|change| change.revision == commit.revision),
             "{commit:?}"
@@ -244,16 +232,13 @@ async fn audited(client: &Client, history: &[Commit]) {
     let at = client.main.at().rest;
     let mut expected: Vec<(u64, &str)> = Vec::new();
     for commit in history {
-        expected.extend(
-            commit
-                .changes
-                .iter()
-                .map(|change| (commit.revision, change.name.as_str())),
-        );
+        expected
+            .extend(commit.changes.iter().map(|change| (commit.revision, change.name.as_str())));
     }
     expected.sort_unstable();
     let entries = client.rest.pages(at, "/api/v1/audit?outcome=allowed").await;
-    let of_audit = |entry: &Value| Some((entry["revision"].as_u64()?, entry["name"].as_str()?.to_owned()));
+    let of_audit =
+        |entry: &Value| Some((entry["revision"].as_u64()?, entry["name"].as_str()?.to_owned()));
     let mut audit: Vec<(u64, String)> = entries.iter().filter_map(of_audit).collect();
     audit.sort_unstable();
     assert!(
@@ -273,10 +258,7 @@ async fn audited(client: &Client, history: &[Commit]) {
         let versions = versions.iter().rev().map(|version| {
             let document = &version["document"];
             assert_eq!(version["revision"], document["revision"]);
-            (
-                document["revision"].as_u64().unwrap(),
-                document["spec"]["config"].clone(),
-            )
+            (document["revision"].as_u64().unwrap(), document["spec"]["config"].clone())
         });
         let changes = changes().filter(|change| change.name == name);
         let changes = changes.map(|change| (change.revision, change.config.clone()));

@@ -1,5 +1,6 @@
-//! Documents as registers: ten clients create, read, swap and delete twenty of them through two processes, which are killed,
-//! as is the store. What all of them were told can be put into one order.
+//! Documents as registers: ten clients create, read, swap and delete twenty of them through two
+//! processes, which are killed, as is the store. What all of them were told can be put into one
+//! order.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -21,7 +22,8 @@ use super::stage::{Main, Stage, blocking, micros, within};
 
 const CLIENTS: usize = 10;
 const KEYS: usize = 20;
-/// Positions of one search. Those of a run without faults are about as many as there are operations.
+/// Positions of one search. Those of a run without faults are about as many as there are
+/// operations.
 const SEARCH: usize = 500_000;
 /// Before a client asks again that could not be answered.
 const PAUSE: Duration = Duration::from_millis(20);
@@ -69,7 +71,8 @@ async fn what_ten_clients_are_told_fits_one_order() {
             assert_eq!(verdict, Verdict::Linearizable, "seed {seed}, key {key}: {events:#?}");
         }
         println!(
-            "seed {seed}, {:?}: {} operations, {done} done, {refused} refused, {lost} unknown; ordered in {:?}",
+            "seed {seed}, {:?}: {} operations, {done} done, {refused} refused, {lost} unknown; \
+             ordered in {:?}",
             Fault::of(seed),
             all.len(),
             begin.elapsed()
@@ -99,7 +102,8 @@ async fn run(seed: u64, stage: &Arc<Stage>, mains: &[Arc<Main>; 2], client: &Cli
     blocking(move || {
         let half = CLIENTS * operations / 2;
         let middle = || begun.load(Ordering::Relaxed) >= half;
-        wait::until("half of the operations", Duration::from_secs(120), middle, String::new).unwrap();
+        wait::until("half of the operations", Duration::from_secs(120), middle, String::new)
+            .unwrap();
         match Fault::of(seed) {
             Fault::Nothing => {}
             Fault::Process(index) => {
@@ -158,8 +162,12 @@ impl User {
                 (_, 0..25) => self.get(key).await,
                 (None, 25..80) => self.change(key, Op::Create(new), 0).await,
                 (None, _) => self.change(key, Op::Delete { seen: None }, 0).await,
-                (Some((seen, revision)), 25..75) => self.change(key, Op::Swap { seen, new }, revision).await,
-                (Some((seen, revision)), 75..88) => self.change(key, Op::Delete { seen: Some(seen) }, revision).await,
+                (Some((seen, revision)), 25..75) => {
+                    self.change(key, Op::Swap { seen, new }, revision).await
+                }
+                (Some((seen, revision)), 75..88) => {
+                    self.change(key, Op::Delete { seen: Some(seen) }, revision).await
+                }
                 (Some(_), 88..92) => self.change(key, Op::Delete { seen: None }, 0).await,
                 (Some(_), _) => self.change(key, Op::Create(new), 0).await,
             };
@@ -175,20 +183,8 @@ impl User {
     }
 
     fn note(&mut self, key: usize, op: Op, outcome: Outcome, begin: u64) {
-        let end = if outcome == Outcome::Unknown {
-            u64::MAX
-        } else {
-            micros()
-        };
-        self.events.push((
-            key,
-            Event {
-                op,
-                outcome,
-                begin,
-                end,
-            },
-        ));
+        let end = if outcome == Outcome::Unknown { u64::MAX } else { micros() };
+        self.events.push((key, Event { op, outcome, begin, end }));
     }
 
     /// `false` when there was no answer; then it was as if nobody had looked.
@@ -197,7 +193,9 @@ impl User {
         let Ok(found) = self.client.get(&self.name(key)).await else {
             return false;
         };
-        let found = found.map(|(revision, config)| (u32::try_from(config["v"].as_u64().unwrap()).unwrap(), revision));
+        let found = found.map(|(revision, config)| {
+            (u32::try_from(config["v"].as_u64().unwrap()).unwrap(), revision)
+        });
         self.note(key, Op::Get, Outcome::Found(found.map(|(content, _)| content)), begin);
         match found {
             Some(found) => self.known.insert(key, found),
@@ -206,18 +204,19 @@ impl User {
         true
     }
 
-    /// `false` when it is certain that nothing was done, for no fault of its own, or when nobody knows.
+    /// `false` when it is certain that nothing was done, for no fault of its own, or when nobody
+    /// knows.
     async fn change(&mut self, key: usize, op: Op, revision: u64) -> bool {
         let name = self.name(key);
         let begin = micros();
         let told = match op {
             Op::Create(new) => self.client.put(&name, &json!({ "v": new }), Must::BeAbsent).await,
             Op::Swap { new, .. } => {
-                self.client
-                    .put(&name, &json!({ "v": new }), Must::HaveRevision(revision))
-                    .await
+                self.client.put(&name, &json!({ "v": new }), Must::HaveRevision(revision)).await
             }
-            Op::Delete { seen: Some(_) } => self.client.delete(&name, Must::HaveRevision(revision)).await,
+            Op::Delete { seen: Some(_) } => {
+                self.client.delete(&name, Must::HaveRevision(revision)).await
+            }
             Op::Delete { seen: None } => self.client.delete(&name, Must::BeThere).await,
             Op::Get => panic!("a look changes nothing"),
         };

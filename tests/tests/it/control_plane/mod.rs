@@ -1,7 +1,9 @@
-//! The configuration service as its users have it: real `blaze-config` processes, reached over REST and gRPC.
+//! The configuration service as its users have it: real `blaze-config` processes, reached over REST
+//! and gRPC.
 //!
-//! Needs `cargo build --workspace` and `scripts/services install` (MongoDB). `BLAZE_LONG` selects the full counts; what
-//! takes time is asserted only there. Measured tests are best run one after another (`--test-threads=1`).
+//! Needs `cargo build --workspace` and `scripts/services install` (MongoDB). `BLAZE_LONG` selects
+//! the full counts; what takes time is asserted only there. Measured tests are best run one after
+//! another (`--test-threads=1`).
 //!
 //! ```text
 //! stage    a store and the processes on it: start, kill -9, start again, backup, restore

@@ -1,5 +1,5 @@
-//! Tokens that are bound to one layer: whatever is outside of it is refused, existing or not, on every route; lists and
-//! watches leave it out.
+//! Tokens that are bound to one layer: whatever is outside of it is refused, existing or not, on
+//! every route; lists and watches leave it out.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -83,7 +83,10 @@ struct Other {
 fn rollout(node: &str, mark: &str) -> Value {
     json!({
         "target": { "kind": "Node", "name": node }, "patch": { "config": { "mark": mark } },
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        "canary": { "node_selector": "canary=true" }, "gate": {
+            "window_s": 60,
+            "max_unhealthy": 0,
+        },
     })
 }
 
@@ -137,7 +140,12 @@ fn documents() -> Value {
         { "kind": "Instance", "service": "both", "name": "e", "spec": { "node": "e1" } },
         { "kind": "Instance", "service": "both", "name": "f", "spec": others()[3].spec },
         { "kind": "Instance", "service": "both", "name": "anywhere", "spec": {} },
-        { "kind": "Instance", "service": "hidden", "name": "h", "spec": { "layer": "fog", "config": { "mark": MARK } } },
+        {
+            "kind": "Instance",
+            "service": "hidden",
+            "name": "h",
+            "spec": { "layer": "fog", "config": { "mark": MARK } },
+        },
     ])
 }
 
@@ -223,16 +231,12 @@ fn cases(made: u64) -> Vec<Case> {
     cases.filtered("/api/v1/topology", "/api/v1/topology");
     cases.filtered("/api/v1/workers", "/api/v1/workers");
     cases.filtered("/api/v1/watch", "/api/v1/watch?since=0&timeout_s=1");
-    // Whose power ends at a layer must not make tokens without such an end, nor trim what concerns all.
+    // Whose power ends at a layer must not make tokens without such an end, nor trim what concerns
+    // all.
     let unbound = json!({ "subject": "a", "roles": ["admin"], "layer": null, "expires_in_s": 60 });
     let bound = json!({ "subject": "a", "roles": ["viewer"], "layer": "edge", "expires_in_s": 60 });
     for (method, route, target, body) in [
-        (
-            "POST",
-            "/api/v1/revert",
-            "/api/v1/revert",
-            json!({ "revision": made, "force": true }),
-        ),
+        ("POST", "/api/v1/revert", "/api/v1/revert", json!({ "revision": made, "force": true })),
         ("POST", "/api/v1/tokens", "/api/v1/tokens", unbound),
         ("POST", "/api/v1/tokens", "/api/v1/tokens", bound),
         ("DELETE", "/api/v1/tokens/{id}", "/api/v1/tokens/absent", Value::Null),
@@ -252,11 +256,8 @@ fn of_kind(cases: &mut Cases, other: &Other, made: u64) {
     // What is there, and what is not: both are outside.
     for name in [other.name, "absent"] {
         let target = format!("{collection}/{name}");
-        for query in [
-            String::new(),
-            "?consistency=cached".to_owned(),
-            format!("?revision={made}"),
-        ] {
+        for query in [String::new(), "?consistency=cached".to_owned(), format!("?revision={made}")]
+        {
             cases.unread(&one, &format!("{target}{query}"));
         }
         let whole = json!({ "spec": spec, "labels": { "a": "b" } });
@@ -265,7 +266,8 @@ fn of_kind(cases: &mut Cases, other: &Other, made: u64) {
         for query in ["", "?cascade=true"] {
             cases.refused("DELETE", &one, &format!("{target}{query}"), Value::Null);
         }
-        for (part, query) in [("history", "view=full".to_owned()), ("diff", format!("from={made}"))] {
+        for (part, query) in [("history", "view=full".to_owned()), ("diff", format!("from={made}"))]
+        {
             cases.unread(&format!("{one}/{part}"), &format!("{target}/{part}?{query}"));
         }
         let back = json!({ "revision": made });
@@ -280,11 +282,7 @@ async fn a_token_of_one_layer_is_refused_on_every_route_to_another() {
     let at = world.main.at().rest;
     let cases = cases(world.made);
     let walked = cases.iter().map(|case| (case.method.to_string(), case.route.clone()));
-    assert_eq!(
-        walked.collect::<BTreeSet<_>>(),
-        operations(),
-        "every operation is walked"
-    );
+    assert_eq!(walked.collect::<BTreeSet<_>>(), operations(), "every operation is walked");
     let (mut refused, mut filtered) = (0, 0);
     for role in ["viewer", "operator", "admin", "worker"] {
         let rest = world.admin.with_token(&stage.token("bound", role, Some("edge")));
@@ -345,10 +343,7 @@ async fn own_layer(stage: &Stage, world: &World) {
         assert_eq!(answer.status, 200, "{target}: {}", answer.text);
     }
     let names = |items: Vec<Value>| {
-        items
-            .iter()
-            .map(|item| item["name"].as_str().unwrap().to_owned())
-            .collect::<Vec<_>>()
+        items.iter().map(|item| item["name"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
     };
     assert_eq!(names(rest.list(at, "nodes").await.1), ["e1"]);
     assert_eq!(names(rest.list(at, "services/-/instances").await.1), ["anywhere", "e"]);
@@ -359,11 +354,6 @@ async fn own_layer(stage: &Stage, world: &World) {
         &json!({ "spec": { "layer": "edge", "config": { "own": true } } }),
     )
     .await;
-    rest.post(
-        at,
-        "/api/v1/nodes",
-        &json!({ "name": "e2", "spec": { "layer": "edge" } }),
-    )
-    .await;
+    rest.post(at, "/api/v1/nodes", &json!({ "name": "e2", "spec": { "layer": "edge" } })).await;
     rest.post(at, "/api/v1/rollouts/to-edge/abort", &json!({})).await;
 }

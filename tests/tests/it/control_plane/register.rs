@@ -40,7 +40,8 @@ pub(crate) struct Event {
 }
 
 impl Event {
-    /// The state after this operation took effect on `state`; `None` when this answer would be wrong there.
+    /// The state after this operation took effect on `state`; `None` when this answer would be
+    /// wrong there.
     pub(crate) fn on(&self, state: Option<Content>) -> Option<Option<Content>> {
         let (fits, after) = match self.op {
             Op::Create(new) => (state.is_none(), Some(new)),

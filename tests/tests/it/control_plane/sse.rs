@@ -75,16 +75,12 @@ impl Events {
     ) -> Result<Self, (u16, Value)> {
         let mut request = rest.http.get(format!("http://{at}/api/v1/watch?{query}"));
         // The patience of other requests is not that of a stream.
-        request = request
-            .bearer_auth(&rest.token)
-            .timeout(std::time::Duration::from_secs(3600));
+        request = request.bearer_auth(&rest.token).timeout(std::time::Duration::from_secs(3600));
         if let Some(last) = last {
             request = request.header("last-event-id", last.to_string());
         }
-        let response = request
-            .send()
-            .await
-            .map_err(|error| (0, Value::String(format!("{error:?}"))))?;
+        let response =
+            request.send().await.map_err(|error| (0, Value::String(format!("{error:?}"))))?;
         let status = response.status().as_u16();
         if status != 200 {
             let text = response.text().await.unwrap_or_default();

@@ -80,10 +80,7 @@ impl Stage {
         for name in ["jwt.key", "enc.key"] {
             std::fs::copy(self.path(name), other.path(name)).unwrap();
         }
-        Self {
-            secret: self.secret.clone(),
-            ..other
-        }
+        Self { secret: self.secret.clone(), ..other }
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
@@ -152,7 +149,8 @@ impl Stage {
                 "grpc": { "listen": "127.0.0.1:0" },
                 "admin": { "listen": "127.0.0.1:0" },
                 "store": self.store_section(),
-                "auth": { "keys": [{ "id": "k1", "alg": "HS256", "file": self.path("jwt.key"), "sign": true }] },
+                "auth": { "keys": [{ "id": "k1", "alg": "HS256", "file": self.path("jwt.key"),
+                    "sign": true }] },
                 "encryption": { "keys": [{ "id": "e1", "file": self.path("enc.key") }] },
                 // Tests open more watches of one subject than anybody may.
                 "limits": { "watches_per_subject": 10_000 },
@@ -165,7 +163,9 @@ impl Stage {
     fn store_section(&self) -> Value {
         match &self.store {
             Store::Sqlite => json!({ "sqlite": { "path": self.path("config.db") } }),
-            Store::Mongo { server, database } => json!({ "mongodb": { "uri": server.uri(), "database": database } }),
+            Store::Mongo { server, database } => {
+                json!({ "mongodb": { "uri": server.uri(), "database": database } })
+            }
         }
     }
 }
@@ -197,19 +197,13 @@ impl Main {
 
     /// The admin port.
     pub(crate) fn admin(&self) -> Admin {
-        Admin {
-            address: self.at().admin,
-            namespace: None,
-        }
+        Admin { address: self.at().admin, namespace: None }
     }
 
     /// What it printed on stdout since its last start.
     pub(crate) fn printed(&self) -> String {
         let process = self.process.lock();
-        process
-            .as_ref()
-            .map(|process| process.stdout().join("\n"))
-            .unwrap_or_default()
+        process.as_ref().map(|process| process.stdout().join("\n")).unwrap_or_default()
     }
 
     /// Resident memory in bytes.
@@ -243,11 +237,8 @@ fn launch(node_file: &Path, log: Option<&Path>) -> anyhow::Result<(Process, Addr
         let word = line.split(' ').find_map(|word| word.strip_prefix(&start));
         Ok(word.with_context(|| format!("no {name} in {line:?}"))?.parse()?)
     };
-    let addresses = Addresses {
-        rest: address("rest")?,
-        grpc: address("grpc")?,
-        admin: address("admin")?,
-    };
+    let addresses =
+        Addresses { rest: address("rest")?, grpc: address("grpc")?, admin: address("admin")? };
     Ok((process, addresses))
 }
 

@@ -67,13 +67,18 @@ impl Stream {
         Self::open_with(client, &format!("since={since}"), None, since).await
     }
 
-    /// Goes on after a revision, as who was cut off does: in REST by the id of the last event, which counts more than what
-    /// the address still says.
+    /// Goes on after a revision, as who was cut off does: in REST by the id of the last event,
+    /// which counts more than what the address still says.
     pub(crate) async fn resume(client: &Client, last: u64) -> Result<Self, Refused> {
         Self::open_with(client, "since=0", Some(last), last).await
     }
 
-    async fn open_with(client: &Client, query: &str, last: Option<u64>, since: u64) -> Result<Self, Refused> {
+    async fn open_with(
+        client: &Client,
+        query: &str,
+        last: Option<u64>,
+        since: u64,
+    ) -> Result<Self, Refused> {
         match client.via {
             Via::Rest => {
                 let opened = Events::open(&client.rest, client.main.at().rest, query, last).await;
@@ -86,16 +91,18 @@ impl Stream {
                 })
             }
             Via::Grpc => {
-                let request = v1::WatchRequest {
-                    since: Some(since),
-                    ..v1::WatchRequest::default()
-                };
+                let request =
+                    v1::WatchRequest { since: Some(since), ..v1::WatchRequest::default() };
                 let opened = client.grpc().await.unwrap().watch(client.signed(request)).await;
                 opened.map(|answer| Self::Grpc(answer.into_inner())).map_err(|status| {
-                    let info = status.get_details_error_info().unwrap_or_else(|| panic!("{status:?}"));
+                    let info =
+                        status.get_details_error_info().unwrap_or_else(|| panic!("{status:?}"));
                     Refused {
                         code: info.metadata["code"].clone(),
-                        oldest_revision: info.metadata.get("oldest_revision").map(|text| text.parse().unwrap()),
+                        oldest_revision: info
+                            .metadata
+                            .get("oldest_revision")
+                            .map(|text| text.parse().unwrap()),
                     }
                 })
             }
@@ -165,11 +172,7 @@ fn of_event(event: &Event) -> Next {
                     config: document["spec"]["config"].clone(),
                 }
             });
-            Next::Commit(Commit {
-                revision,
-                previous: None,
-                changes: changes.collect(),
-            })
+            Next::Commit(Commit { revision, previous: None, changes: changes.collect() })
         }
         "bookmark" => {
             let revision = data["revision"].as_u64().unwrap();

@@ -1,4 +1,5 @@
-//! Many watchers at once: each is told everything, once, in order and whole, whatever happens to its connection.
+//! Many watchers at once: each is told everything, once, in order and whole, whatever happens to
+//! its connection.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -40,7 +41,8 @@ fn writer(client: &Client, mains: &[Arc<Main>; 2], index: usize, padding: usize)
     Writer::new(client, &format!("w{index}"), DOCUMENTS, padding)
 }
 
-/// Half of the watchers by REST, half by gRPC; half of each begin at the one process, half at the other.
+/// Half of the watchers by REST, half by gRPC; half of each begin at the one process, half at the
+/// other.
 fn clients_of(client: &Client, mains: &[Arc<Main>; 2], index: usize) -> Vec<Client> {
     let via = if index.is_multiple_of(2) { Via::Rest } else { Via::Grpc };
     let mut clients = vec![client.at(via, &mains[0]), client.at(via, &mains[1])];
@@ -63,12 +65,7 @@ async fn each_is_told_everything_once_while_it_is_cut_and_the_history_is_trimmed
     for index in 0..watchers {
         let mut cuts: Vec<u64> = (0..cuts).map(|_| random.random_range(1..writes as u64)).collect();
         cuts.sort_unstable_by(|one, other| other.cmp(one));
-        let plan = Plan {
-            cuts,
-            late: 4,
-            floor: floor_seen.clone(),
-            end: end_seen.clone(),
-        };
+        let plan = Plan { cuts, late: 4, floor: floor_seen.clone(), end: end_seen.clone() };
         let clients = clients_of(&client, &mains, index);
         following.spawn(async move { Watcher::start(clients).await.run(plan).await });
     }
@@ -110,7 +107,8 @@ async fn each_is_told_everything_once_while_it_is_cut_and_the_history_is_trimmed
             assert_eq!(watcher.state, state, "{:?}", watcher.tally);
         }
     }
-    let sum = |one: fn(&Tally) -> usize| seen.iter().map(|watcher| one(&watcher.tally)).sum::<usize>();
+    let sum =
+        |one: fn(&Tally) -> usize| seen.iter().map(|watcher| one(&watcher.tally)).sum::<usize>();
     let gone = sum(|tally| tally.lists) - seen.len();
     println!(
         "{} commits told, {} cuts, {gone} times 410, {} times too slow",
@@ -205,7 +203,8 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
         true => (Duration::from_secs(60), Duration::from_millis(40)),
         false => (Duration::ZERO, Duration::from_millis(1)),
     };
-    let mut writers: Vec<Writer> = (0..4).map(|index| writer(&client, &mains, index, 1024)).collect();
+    let mut writers: Vec<Writer> =
+        (0..4).map(|index| writer(&client, &mains, index, 1024)).collect();
     let mut first = 0;
     for writer in &mut writers {
         first = writer.put_all().await;
@@ -213,9 +212,8 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
     let mut standing = Vec::new();
     for (via, client) in [(Via::Rest, narrow(&client)), (Via::Grpc, client.clone())] {
         let client = client.at(via, &mains[0]);
-        let mut stream = Stream::open(&client, first)
-            .await
-            .unwrap_or_else(|refused| panic!("{refused:?}"));
+        let mut stream =
+            Stream::open(&client, first).await.unwrap_or_else(|refused| panic!("{refused:?}"));
         // The second one says that it has caught up.
         for _ in 0..2 {
             assert_eq!(stream.next().await, Next::Bookmark(first));
@@ -262,12 +260,7 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
     let seen = within("the watchers", limit, following.join_all()).await;
     let stood = begin.elapsed();
     for (client, stream) in standing {
-        within(
-            "the end of who stands still",
-            limit,
-            ended(&client, stream, first, last),
-        )
-        .await;
+        within("the end of who stands still", limit, ended(&client, stream, first, last)).await;
     }
 
     let slow: usize = seen.iter().map(|watcher| watcher.tally.slow).sum();
@@ -276,7 +269,8 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
         .flat_map(|watcher| watcher.tally.delays.iter().copied())));
     let grown = most.saturating_sub(before) / 1024 / 1024;
     println!(
-        "{} commits in {stood:?} to {watchers} watchers: p99 {delay:?}, {slow} times too slow; RSS {} MiB, at most {grown} MiB more",
+        "{} commits in {stood:?} to {watchers} watchers: p99 {delay:?}, {slow} times too slow; RSS \
+         {} MiB, at most {grown} MiB more",
         last - first,
         before / 1024 / 1024
     );
@@ -287,7 +281,8 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
     }
 }
 
-/// REST over HTTP/2 with a small window: what is not read stays with the service, not in buffers of the system.
+/// REST over HTTP/2 with a small window: what is not read stays with the service, not in buffers of
+/// the system.
 fn narrow(client: &Client) -> Client {
     let http = reqwest::Client::builder().no_proxy().http2_prior_knowledge();
     client.over(http.http2_initial_stream_window_size(65_535).build().unwrap())
@@ -301,12 +296,7 @@ fn follow(
     end: &watch::Receiver<Option<u64>>,
 ) -> JoinSet<Watcher> {
     let following = (0..watchers).map(|index| {
-        let plan = Plan {
-            cuts: Vec::new(),
-            late: 1,
-            floor: watch::channel(0).1,
-            end: end.clone(),
-        };
+        let plan = Plan { cuts: Vec::new(), late: 1, floor: watch::channel(0).1, end: end.clone() };
         let clients = clients_of(client, mains, index);
         async move { Watcher::start(clients).await.run(plan).await }
     });
@@ -334,7 +324,8 @@ async fn all_open(mains: &[Arc<Main>; 2], watchers: usize) {
     .await;
 }
 
-/// Who stood still reads on: what comes has no gap, then it is told why it ends; and it can go on where it was.
+/// Who stood still reads on: what comes has no gap, then it is told why it ends; and it can go on
+/// where it was.
 async fn ended(client: &Client, mut stream: Stream, first: u64, last: u64) {
     let mut cursor = first;
     let code = loop {
@@ -351,9 +342,8 @@ async fn ended(client: &Client, mut stream: Stream, first: u64, last: u64) {
     println!("{:?} got {} of {} commits", client.via, cursor - first, last - first);
     assert_eq!(code, "watch_too_slow");
     assert!(cursor + (MAX_BEHIND as u64) < last, "it was not behind");
-    let mut stream = Stream::resume(client, cursor)
-        .await
-        .unwrap_or_else(|refused| panic!("{refused:?}"));
+    let mut stream =
+        Stream::resume(client, cursor).await.unwrap_or_else(|refused| panic!("{refused:?}"));
     let rest: Vec<Commit> = stream.until(last).await.unwrap_or_else(|other| panic!("{other:?}"));
     let revisions: Vec<u64> = rest.iter().map(|commit| commit.revision).collect();
     assert_eq!(revisions, (cursor + 1..=last).collect::<Vec<u64>>());

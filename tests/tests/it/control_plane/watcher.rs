@@ -6,9 +6,9 @@
 //!  └────────────────────────────── 410 ──────────────────────────────────────┘
 //! ```
 //!
-//! What is checked of each commit: it is the next revision (so none is missing, none comes twice, all are in order), it is
-//! whole (a [`Writer`](super::writer::Writer) says in each document how many belong together), and each change fits what
-//! is known of its document.
+//! What is checked of each commit: it is the next revision (so none is missing, none comes twice,
+//! all are in order), it is whole (a [`Writer`](super::writer::Writer) says in each document how
+//! many belong together), and each change fits what is known of its document.
 
 use std::collections::BTreeMap;
 
@@ -48,7 +48,8 @@ pub(crate) struct Tally {
     pub(crate) left: usize,
     /// How often it was ended because it was too slow.
     pub(crate) slow: usize,
-    /// From before a write was sent until it was told, in microseconds; of writes that began while the watch was open.
+    /// From before a write was sent until it was told, in microseconds; of writes that began while
+    /// the watch was open.
     pub(crate) delays: Vec<u64>,
 }
 
@@ -153,7 +154,9 @@ impl Watcher {
                 self.stream = None;
                 self.list().await;
             }
-            other @ (Next::Ended(_) | Next::Over) => panic!("{:?} ends with {other:?}", self.client().main),
+            other @ (Next::Ended(_) | Next::Over) => {
+                panic!("{:?} ends with {other:?}", self.client().main)
+            }
         }
     }
 
@@ -202,11 +205,7 @@ impl Watcher {
     async fn list(&mut self) {
         let client = self.client();
         let (revision, items) = client.rest.list(client.main.at().rest, "services").await;
-        assert!(
-            revision >= self.cursor,
-            "a list of {revision} after a commit of {}",
-            self.cursor
-        );
+        assert!(revision >= self.cursor, "a list of {revision} after a commit of {}", self.cursor);
         self.state = state_of(&items);
         self.cursor = revision;
         self.tally.lists += 1;
@@ -215,10 +214,7 @@ impl Watcher {
     fn take(&mut self, commit: &Commit) {
         let revision = commit.revision;
         assert_eq!(revision, self.cursor + 1, "{:?}", self.client().main);
-        assert!(
-            commit.previous.is_none_or(|previous| previous == self.cursor),
-            "{commit:?}"
-        );
+        assert!(commit.previous.is_none_or(|previous| previous == self.cursor), "{commit:?}");
         for change in &commit.changes {
             self.take_one(commit, change);
         }
@@ -271,10 +267,7 @@ async fn reaches<T>(receiver: &mut watch::Receiver<T>, holds: impl FnMut(&T) -> 
 pub(crate) fn state_of(items: &[Value]) -> State {
     let one = |item: &Value| {
         let name = item["name"].as_str().unwrap().to_owned();
-        (
-            name,
-            (item["revision"].as_u64().unwrap(), item["spec"]["config"].clone()),
-        )
+        (name, (item["revision"].as_u64().unwrap(), item["spec"]["config"].clone()))
     };
     items.iter().map(one).collect()
 }

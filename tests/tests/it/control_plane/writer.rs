@@ -1,4 +1,5 @@
-//! Somebody who changes services of their own, one commit after the other, and must succeed each time.
+//! Somebody who changes services of their own, one commit after the other, and must succeed each
+//! time.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +10,8 @@ use serde_json::{Value, json};
 use super::client::{Client, Must, Told};
 use super::stage::micros;
 
-/// How often a write is tried that was refused without a fault of its own: the other process was first again and again.
+/// How often a write is tried that was refused without a fault of its own: the other process was
+/// first again and again.
 const TRIES: usize = 20;
 
 /// One commit, which may be tried several times.
@@ -36,9 +38,7 @@ pub(crate) struct Writer {
 impl Writer {
     /// Of so many services, each with so many bytes of padding.
     pub(crate) fn new(client: Client, name: &str, documents: usize, padding: usize) -> Self {
-        let seed = name
-            .bytes()
-            .fold(7, |seed: u64, byte| seed.wrapping_mul(31) + u64::from(byte));
+        let seed = name.bytes().fold(7, |seed: u64, byte| seed.wrapping_mul(31) + u64::from(byte));
         Self {
             client,
             name: name.to_owned(),
@@ -50,7 +50,8 @@ impl Writer {
         }
     }
 
-    /// One commit: mostly one service is put, sometimes deleted, sometimes all of them are put at once. Gives its revision.
+    /// One commit: mostly one service is put, sometimes deleted, sometimes all of them are put at
+    /// once. Gives its revision.
     pub(crate) async fn write(&mut self) -> u64 {
         match self.random.random_range(0..100) {
             0..2 => self.put_all().await,
@@ -62,9 +63,8 @@ impl Writer {
     /// All services in one commit.
     pub(crate) async fn put_all(&mut self) -> u64 {
         let config = self.config(self.documents);
-        let documents: Vec<(String, Value)> = (0..self.documents)
-            .map(|index| (self.service(index), config.clone()))
-            .collect();
+        let documents: Vec<(String, Value)> =
+            (0..self.documents).map(|index| (self.service(index), config.clone())).collect();
         let revision = self.insist(Write::Apply(&documents)).await;
         self.there = documents.into_iter().map(|(name, _)| (name, revision)).collect();
         revision
@@ -74,10 +74,8 @@ impl Writer {
     pub(crate) async fn put_one(&mut self) -> u64 {
         let index = self.random.random_range(0..self.documents);
         let (name, config) = (self.service(index), self.config(1));
-        let must = self
-            .there
-            .get(&name)
-            .map_or(Must::BeAbsent, |revision| Must::HaveRevision(*revision));
+        let must =
+            self.there.get(&name).map_or(Must::BeAbsent, |revision| Must::HaveRevision(*revision));
         let revision = self.insist(Write::Put(&name, &config, must)).await;
         self.there.insert(name, revision);
         revision
@@ -116,9 +114,15 @@ impl Writer {
         format!("{}-{index}", self.name)
     }
 
-    /// Says when it was written, and with how many others: who reads it can tell whether a commit is whole.
+    /// Says when it was written, and with how many others: who reads it can tell whether a commit
+    /// is whole.
     fn config(&mut self, of: usize) -> Value {
         self.count += 1;
-        json!({ "batch": format!("{}-{}", self.name, self.count), "of": of, "at": micros(), "padding": self.padding })
+        json!({
+            "batch": format!("{}-{}", self.name, self.count),
+            "of": of,
+            "at": micros(),
+            "padding": self.padding,
+        })
     }
 }

@@ -25,19 +25,12 @@ fn demo(arguments: &[&str]) -> Run {
     command.extend(arguments);
     let mut process = Process::start("blaze", &command, None).unwrap();
     let code = process.exit(Duration::from_secs(120)).unwrap();
-    let lines: Vec<Value> = process
-        .stdout()
-        .iter()
-        .map(|line| serde_json::from_str(line).unwrap())
-        .collect();
-    let (summaries, rows): (Vec<Value>, Vec<Value>) = lines.into_iter().partition(|line| line["kind"] == "summary");
+    let lines: Vec<Value> =
+        process.stdout().iter().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let (summaries, rows): (Vec<Value>, Vec<Value>) =
+        lines.into_iter().partition(|line| line["kind"] == "summary");
     let summary = summaries.first().cloned().unwrap_or_default();
-    Run {
-        code,
-        rows,
-        summary,
-        tail: process.tail(),
-    }
+    Run { code, rows, summary, tail: process.tail() }
 }
 
 fn number(value: &Value) -> f64 {
@@ -87,10 +80,8 @@ fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
         }
     }
     let cloud = run.summary["topics"].as_array().unwrap().iter();
-    let routes: Vec<&Value> = cloud
-        .filter(|row| row["to"] == "cloud/cloud-1")
-        .map(|row| &row["route"])
-        .collect();
+    let routes: Vec<&Value> =
+        cloud.filter(|row| row["to"] == "cloud/cloud-1").map(|row| &row["route"]).collect();
     assert!(
         routes.contains(&&serde_json::json!(["node:memory", "inter:dds", "layer:memory"])),
         "{routes:?}"
@@ -113,17 +104,15 @@ fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
             "a change comes within a second: {change}"
         );
     }
-    assert!(
-        number(&service["after_per_s"]) > 2.0 * number(&service["before_per_s"]),
-        "{service}"
-    );
+    assert!(number(&service["after_per_s"]) > 2.0 * number(&service["before_per_s"]), "{service}");
     assert!(number(&link["after_per_s"]) < number(&link["before_per_s"]), "{link}");
     println!("{}", run.summary);
 }
 
 #[test]
 fn a_part_of_the_nodes_and_a_short_run_change_nothing_and_say_so() {
-    // A part of the nodes looks for the others, and those of another demo on this host have the same names.
+    // A part of the nodes looks for the others, and those of another demo on this host have the
+    // same names.
     let domain = format!("brokers.inter.dds.domain={}", free_domain().unwrap());
     for (arguments, why) in [
         (
@@ -141,15 +130,13 @@ fn a_part_of_the_nodes_and_a_short_run_change_nothing_and_say_so() {
 /// Another recording: text and numbers as ROS 2 CDR, two topics, LZ4 chunks.
 fn write_recording(path: &Path) {
     let file = std::fs::File::create(path).unwrap();
-    let options = mcap::WriteOptions::new()
-        .profile("ros2")
-        .compression(Some(mcap::Compression::Lz4));
+    let options =
+        mcap::WriteOptions::new().profile("ros2").compression(Some(mcap::Compression::Lz4));
     let mut writer = options.create(std::io::BufWriter::new(file)).unwrap();
     let mut channels = Vec::new();
-    for (topic, kind) in [
-        ("/chatter", "std_msgs/msg/String"),
-        ("/scan", "sensor_msgs/msg/LaserScan"),
-    ] {
+    for (topic, kind) in
+        [("/chatter", "std_msgs/msg/String"), ("/scan", "sensor_msgs/msg/LaserScan")]
+    {
         let schema = writer.add_schema(kind, "ros2msg", b"string data").unwrap();
         channels.push(writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).unwrap());
     }
@@ -180,16 +167,11 @@ fn another_recording_works_alike() {
     assert_eq!(run.code, Some(0), "{}", run.tail);
     let topics = run.summary["topics"].as_array().unwrap();
     for topic in ["chatter", "scan"] {
-        let to_cloud = topics
-            .iter()
-            .find(|row| row["topic"] == topic && row["to"] == "cloud/cloud-1");
+        let to_cloud =
+            topics.iter().find(|row| row["topic"] == topic && row["to"] == "cloud/cloud-1");
         let row = to_cloud.unwrap_or_else(|| panic!("{topic} to the cloud: {}", run.summary));
         assert!(number(&row["received"]) > 50.0, "{row}");
-        assert_eq!(
-            (&row["lost"], &row["duplicated"]),
-            (&Value::from(0), &Value::from(0)),
-            "{row}"
-        );
+        assert_eq!((&row["lost"], &row["duplicated"]), (&Value::from(0), &Value::from(0)), "{row}");
     }
 }
 
@@ -201,13 +183,10 @@ fn what_cannot_be_played_ends_with_its_code_and_reason() {
         (&["--set", "nonsense=1"], 2, "nonsense"),
         (&["--set", "flow.bandwidth.limit_mbps=-1"], 2, "limit_mbps"),
         (&["--set", "admin.flow=127.0.0.1:80x"], 2, "admin.flow"),
-        (
-            &["--only", "robot-1", "--record", "/no/such/file"],
-            1,
-            "/no/such/file: ",
-        ),
+        (&["--only", "robot-1", "--record", "/no/such/file"], 1, "/no/such/file: "),
     ] {
-        let mut process = Process::start("blaze", &[&["demo"][..], arguments].concat(), None).unwrap();
+        let mut process =
+            Process::start("blaze", &[&["demo"][..], arguments].concat(), None).unwrap();
         assert_eq!(process.exit(DEADLINE).unwrap(), Some(code), "{}", process.tail());
         assert!(process.tail().contains(why), "{}", process.tail());
     }
@@ -217,17 +196,8 @@ fn what_cannot_be_played_ends_with_its_code_and_reason() {
 fn signals_end_a_run_at_once_with_its_summary() {
     for signal in [Signal::INT, Signal::TERM] {
         let set = format!("brokers.inter.dds.domain={}", free_domain().unwrap());
-        let arguments = [
-            "demo",
-            "--only",
-            "robot-1,fog-1",
-            "--duration",
-            "10m",
-            "-o",
-            "json",
-            "--set",
-            &set,
-        ];
+        let arguments =
+            ["demo", "--only", "robot-1,fog-1", "--duration", "10m", "-o", "json", "--set", &set];
         let mut demo = Process::start("blaze", &arguments, None).unwrap();
         // The first row comes when it has begun: before that there is nothing to sum up.
         let begun = || demo.stdout().first().is_some_and(|line| line.contains("\"row\""));

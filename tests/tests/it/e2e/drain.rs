@@ -12,7 +12,9 @@ use blaze_flow::flow::settings::{FlowSettings, InterSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::world::LayerScopeId;
 use blaze_runtime::Supervisor;
-use blaze_sdk::{Advertise, PublishOptions, Request, ServiceManager, ServiceOptions, SubscribeOptions};
+use blaze_sdk::{
+    Advertise, PublishOptions, Request, ServiceManager, ServiceOptions, SubscribeOptions,
+};
 use blaze_tests::admin::Admin;
 use blaze_tests::flow::free_domain;
 use blaze_tests::wait;
@@ -45,29 +47,22 @@ async fn flow(
             chunking: Chunking::Mtu,
         }),
         live: LiveSettings::from(&FlowSection {
-            bandwidth: BandwidthSection {
-                limit_mbps: LIMIT_MBPS,
-                ..BandwidthSection::default()
-            },
+            bandwidth: BandwidthSection { limit_mbps: LIMIT_MBPS, ..BandwidthSection::default() },
             ..FlowSection::default()
         }),
     };
-    let layer = LayerBroker {
-        broker: Arc::new(hub.broker()),
-        id: LayerScopeId::private(),
-    };
-    let options = FlowOptions {
-        settings,
-        node: None,
-        layer: Some(layer),
-        state_dir: None,
-    };
+    let layer = LayerBroker { broker: Arc::new(hub.broker()), id: LayerScopeId::private() };
+    let options = FlowOptions { settings, node: None, layer: Some(layer), state_dir: None };
     let flow = blaze_flow::flow::start(options, all.child(name)).await?;
     tokio::time::timeout(Duration::from_secs(30), flow.ready()).await?;
     Ok(flow)
 }
 
-async fn service(name: &str, flow: &RunningFlow, hub: &MemoryHub) -> anyhow::Result<ServiceManager> {
+async fn service(
+    name: &str,
+    flow: &RunningFlow,
+    hub: &MemoryHub,
+) -> anyhow::Result<ServiceManager> {
     let options = ServiceOptions::new(
         flow.id().layer.clone(),
         name.parse()?,
@@ -105,30 +100,17 @@ async fn stop_with_a_full_queue() -> anyhow::Result<()> {
     let heard = move |_| {
         count.fetch_add(1, Ordering::Relaxed);
     };
-    let _ear = listener
-        .broker()
-        .subscribe(&topic, SubscribeOptions::default(), heard)
-        .await?;
-    let request = Request {
-        reliability: Reliability::Reliable,
-        ..Request::new(topic.clone())
-    };
+    let _ear = listener.broker().subscribe(&topic, SubscribeOptions::default(), heard).await?;
+    let request = Request { reliability: Reliability::Reliable, ..Request::new(topic.clone()) };
     let _wants = listener.flow().request(request).await?;
-    let advertise = Advertise {
-        reliability: Reliability::Reliable,
-        ..Advertise::new(topic.clone())
-    };
+    let advertise =
+        Advertise { reliability: Reliability::Reliable, ..Advertise::new(topic.clone()) };
     let _has = talker.flow().advertise(advertise).await?;
-    let reliable = PublishOptions {
-        reliability: Reliability::Reliable,
-        ..PublishOptions::default()
-    };
+    let reliable =
+        PublishOptions { reliability: Reliability::Reliable, ..PublishOptions::default() };
     let publisher = talker.broker().publisher(&topic, &reliable)?;
 
-    let admin = Admin {
-        address: edge.admin(),
-        namespace: None,
-    };
+    let admin = Admin { address: edge.admin(), namespace: None };
     let payload = Bytes::from(vec![1; BYTES]);
     let flows = || {
         publisher.publish(payload.clone());

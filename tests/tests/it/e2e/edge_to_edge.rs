@@ -1,4 +1,5 @@
-//! Two robots of one layer meet over its DDS domain: node > layer > node, without the inter scope, though they have one.
+//! Two robots of one layer meet over its DDS domain: node > layer > node, without the inter scope,
+//! though they have one.
 
 use std::cell::RefCell;
 use std::time::Duration;
@@ -40,12 +41,7 @@ impl Robots {
         for robot in &mut robots {
             robot.wait_ready()?;
         }
-        Ok(Self {
-            redis,
-            run,
-            robots,
-            layer_domain,
-        })
+        Ok(Self { redis, run, robots, layer_domain })
     }
 
     fn channel(&self, robot: usize, name: &str) -> String {
@@ -54,8 +50,10 @@ impl Robots {
 
     /// Published on the first robot, asked for on the second, and bridged.
     fn bridge(&self, terms: &Value) -> anyhow::Result<()> {
-        let mut advertise = json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0});
-        let mut request = json!({"op":"request","topic":TOPIC,"service":"logger","bare":true,"ttl_s":0});
+        let mut advertise =
+            json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0});
+        let mut request =
+            json!({"op":"request","topic":TOPIC,"service":"logger","bare":true,"ttl_s":0});
         for message in [&mut advertise, &mut request] {
             let more = terms.as_object().into_iter().flatten();
             more.for_each(|(key, value)| message[key] = value.clone());
@@ -74,7 +72,11 @@ impl Robots {
     }
 }
 
-fn publish(connection: &mut redis::Connection, channel: &str, payload: &[u8]) -> anyhow::Result<()> {
+fn publish(
+    connection: &mut redis::Connection,
+    channel: &str,
+    payload: &[u8],
+) -> anyhow::Result<()> {
     redis::cmd("PUBLISH").arg(channel).arg(payload).exec(connection)?;
     Ok(())
 }
@@ -93,18 +95,15 @@ fn a_plain_dds_program_reads_what_a_robot_publishes() -> anyhow::Result<()> {
         || {
             let _ = publish(&mut connection, &channel, b"{}");
             let lines = plain.stdout();
-            let newest: Option<Value> = lines.last().and_then(|line| serde_json::from_str(line).ok());
+            let newest: Option<Value> =
+                lines.last().and_then(|line| serde_json::from_str(line).ok());
             newest.is_some_and(|report| report["received"].as_u64() >= Some(20))
         },
         || format!("{}\n{}", plain.tail(), robots.last_words()),
     )?;
     let lines = plain.stdout();
     let report: Value = serde_json::from_str(lines.last().map_or("{}", String::as_str))?;
-    assert_eq!(
-        (&report["malformed"], &report["reordered"]),
-        (&json!(0), &json!(0)),
-        "{report}"
-    );
+    assert_eq!((&report["malformed"], &report["reordered"]), (&json!(0), &json!(0)), "{report}");
     Ok(())
 }
 
@@ -114,7 +113,8 @@ fn what_a_robot_kills_comes_back_over_the_layer() -> anyhow::Result<()> {
     robots.bridge(&json!({"reliability":"reliable"}))?;
     let channel = robots.channel(0, TOPIC);
     let arrives = |robots: &Robots| -> anyhow::Result<Duration> {
-        let mut reader = RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
+        let mut reader =
+            RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
         let mut connection = connect(&robots.redis)?;
         wait::until(
             "messages arrive",
@@ -173,7 +173,8 @@ mod quick {
     #[test]
     fn a_topic_goes_from_node_to_node_over_the_layer() -> anyhow::Result<()> {
         let robots = Robots::start()?;
-        let mut reader = RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
+        let mut reader =
+            RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
         robots.bridge(&json!({"reliability":"reliable"}))?;
         let mut connection = connect(&robots.redis)?;
         let channel = robots.channel(0, TOPIC);
@@ -216,7 +217,9 @@ mod quick {
         let brokers = (&bridge["from"]["broker"], &bridge["to"]["broker"]);
         assert_eq!(brokers, (&json!("dds"), &json!("redis")), "{bridge}");
         assert!(bridge["out"]["messages"].as_u64() >= Some(MESSAGES), "{bridge}");
-        for (robot, to) in [(&robots.robots[0], "edge/robot-2"), (&robots.robots[1], "edge/robot-2")] {
+        for (robot, to) in
+            [(&robots.robots[0], "edge/robot-2"), (&robots.robots[1], "edge/robot-2")]
+        {
             let why = robot.why(TOPIC, Some(to))?;
             assert!(
                 ["flowing", "degraded"].contains(&why["verdict"].as_str().unwrap_or_default()),

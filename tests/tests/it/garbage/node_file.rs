@@ -1,4 +1,5 @@
-//! `blaze-flow` and its options: faults of the node file with their places, exit codes, live reload.
+//! `blaze-flow` and its options: faults of the node file with their places, exit codes, live
+//! reload.
 
 use std::path::Path;
 use std::process::Command;
@@ -12,7 +13,11 @@ use serde_json::Value;
 const DEADLINE: Duration = Duration::from_secs(20);
 
 /// Exit code, stdout and stderr of a program that ends by itself.
-fn output(program: &str, arguments: &[&str], environment: &[(&str, &str)]) -> (Option<i32>, String, String) {
+fn output(
+    program: &str,
+    arguments: &[&str],
+    environment: &[(&str, &str)],
+) -> (Option<i32>, String, String) {
     let mut command = Command::new(binary(program).unwrap());
     command.args(arguments).env_remove("BLAZE_CONFIG");
     let output = command.envs(environment.iter().copied()).output().unwrap();
@@ -92,11 +97,7 @@ fn options_and_environment_go_before_the_file() {
     let (limit, key) = ("BLAZE__FLOW__BANDWIDTH__LIMIT_MBPS", "flow.bandwidth.limit_mbps");
     let check = |value: &str, more: &[&str]| {
         let arguments = [&["--check"][..], more].concat();
-        output(
-            "blaze-flow",
-            &arguments,
-            &[("BLAZE_CONFIG", path.as_str()), (limit, value)],
-        )
+        output("blaze-flow", &arguments, &[("BLAZE_CONFIG", path.as_str()), (limit, value)])
     };
     assert_eq!(check("7", &[]).0, Some(0));
     let (code, _, faults) = check("fast", &[]);
@@ -109,7 +110,8 @@ fn options_and_environment_go_before_the_file() {
 #[test]
 fn an_instance_that_can_be_none_is_a_fault_of_the_configuration() {
     let folder = tempfile::tempdir().unwrap();
-    let content = small_file(folder.path(), "40").replace("memory: {}", "redis: { url: \"redis://127.0.0.1:9\" }");
+    let content = small_file(folder.path(), "40")
+        .replace("memory: {}", "redis: { url: \"redis://127.0.0.1:9\" }");
     let server = "config: { server: \"http://127.0.0.1:9\" }\n";
     let path = written(folder.path(), "blaze.yaml", &(content + server));
     for (program, arguments, expected) in [
@@ -131,10 +133,7 @@ fn an_instance_that_can_be_none_is_a_fault_of_the_configuration() {
 /// A `blaze-flow` that has printed its ready line.
 fn started(path: &str) -> (Process, Admin) {
     let process = Process::start("blaze-flow", &["--config", path], None).unwrap();
-    let admin = Admin {
-        address: process.ready_at("admin", DEADLINE).unwrap(),
-        namespace: None,
-    };
+    let admin = Admin { address: process.ready_at("admin", DEADLINE).unwrap(), namespace: None };
     (process, admin)
 }
 
@@ -162,7 +161,8 @@ fn becomes(admin: &Admin, wanted: f64, status: &str) {
 #[test]
 fn the_limit_changes_while_the_flow_runs() {
     let folder = tempfile::tempdir().unwrap();
-    let write = |value: &str| written(folder.path(), "blaze.yaml", &small_file(folder.path(), value));
+    let write =
+        |value: &str| written(folder.path(), "blaze.yaml", &small_file(folder.path(), value));
     let path = write("40");
     let (mut process, admin) = started(&path);
     becomes(&admin, 40.0, "ok");
@@ -184,10 +184,7 @@ fn the_limit_changes_while_the_flow_runs() {
     // SIGHUP reads it again, also when it says the same.
     let reloads = || {
         let lines = process.stderr();
-        lines
-            .iter()
-            .filter(|line| line.contains("configuration reloaded"))
-            .count()
+        lines.iter().filter(|line| line.contains("configuration reloaded")).count()
     };
     let before = reloads();
     process.signal(Signal::HUP).unwrap();

@@ -1,4 +1,5 @@
-//! The admin JSON: every key of the contract is there, with a value of its type, while messages flow.
+//! The admin JSON: every key of the contract is there, with a value of its type, while messages
+//! flow.
 
 use std::time::Duration;
 
@@ -11,7 +12,8 @@ use blaze_tests::wait;
 
 const DEADLINE: Duration = Duration::from_secs(20);
 
-/// `key` or `key?`, where `?` allows null; then the type: s(text) n(number) b(ool) o(bject) a(rray).
+/// `key` or `key?`, where `?` allows null; then the type: s(text) n(number) b(ool) o(bject)
+/// a(rray).
 fn check(value: &Value, keys: &str) {
     for key in keys.split_whitespace() {
         let (key, kind) = key.split_once(':').unwrap();
@@ -50,7 +52,10 @@ fn topics(admin: &Admin) {
     let answer = ask(admin, "/v1/topics");
     for row in rows(&answer, "topics") {
         check(row, "topic:s state:s rate_hz:n bytes_per_s:n advertised:a requested:a");
-        assert!(["flowing", "no_request", "no_advertise", "blocked"].contains(&row["state"].as_str().unwrap()));
+        assert!(
+            ["flowing", "no_request", "no_advertise", "blocked"]
+                .contains(&row["state"].as_str().unwrap())
+        );
         for advertised in rows(row, "advertised") {
             check(advertised, identity);
             check(
@@ -68,21 +73,14 @@ fn topics(admin: &Admin) {
 fn bridges(admin: &Admin) {
     let answer = ask(admin, "/v1/bridges");
     for row in rows(&answer, "bridges") {
-        check(
-            row,
-            "id:s topic:s from:o to:o state:s since_s:n in:o out:o queued:n dropped:o",
-        );
+        check(row, "id:s topic:s from:o to:o state:s since_s:n in:o out:o queued:n dropped:o");
         check(&row["from"], "scope:s broker:s");
         check(&row["to"], "scope:s broker:s layer:s flow:s");
         check(&row["in"], "messages:n bytes:n");
         check(&row["out"], "messages:n bytes:n");
         check(&row["latency_ms"], "p50:n? p99:n?");
-        let dropped: u64 = row["dropped"]
-            .as_object()
-            .unwrap()
-            .values()
-            .map(|count| count.as_u64().unwrap())
-            .sum();
+        let dropped: u64 =
+            row["dropped"].as_object().unwrap().values().map(|count| count.as_u64().unwrap()).sum();
         let number = |key: &str| row[key]["messages"].as_u64().unwrap();
         assert_eq!(
             number("in"),
@@ -90,10 +88,8 @@ fn bridges(admin: &Admin) {
             "{row}"
         );
         let id = row["id"].as_str().unwrap();
-        let (from, to) = (
-            row["from"]["scope"].as_str().unwrap(),
-            row["to"]["scope"].as_str().unwrap(),
-        );
+        let (from, to) =
+            (row["from"]["scope"].as_str().unwrap(), row["to"]["scope"].as_str().unwrap());
         let layer = row["to"]["layer"].as_str().unwrap();
         assert_eq!(id, format!("{}|{from}>{to}|{layer}", row["topic"].as_str().unwrap()));
     }
@@ -104,7 +100,8 @@ fn peers(admin: &Admin) {
     for row in rows(&answer, "peers") {
         check(
             row,
-            "flow:s layer:s kind:s epoch:n version:n state:s last_heard_ms:n? rtt_ms:n? clock_offset_ms:n? \
+            "flow:s layer:s kind:s epoch:n version:n state:s last_heard_ms:n? rtt_ms:n? \
+             clock_offset_ms:n? \
              clock_error_ms:n? loss:n address:s?",
         );
     }
@@ -120,10 +117,7 @@ fn allocation(admin: &Admin) {
         check(row, "topic:s class:s size_bytes:n advertised_hz:n lanes:a");
         assert!(["standard", "large"].contains(&row["class"].as_str().unwrap()));
         for lane in rows(row, "lanes") {
-            check(
-                lane,
-                "layer:s allocated_hz:n? actual_hz:n skipped:n exceeds_advertised:b",
-            );
+            check(lane, "layer:s allocated_hz:n? actual_hz:n skipped:n exceeds_advertised:b");
         }
     }
     for row in rows(&answer, "links") {
@@ -150,7 +144,8 @@ fn why(admin: &Admin) {
             check(step, "flow:s step:s ok:b code:s detail:s");
             let step = step["step"].as_str().unwrap();
             assert!(
-                ["advertise", "request", "plan", "bridge", "admit", "link", "deliver"].contains(&step),
+                ["advertise", "request", "plan", "bridge", "admit", "link", "deliver"]
+                    .contains(&step),
                 "{step}"
             );
         }
@@ -158,10 +153,7 @@ fn why(admin: &Admin) {
     for question in ["", "?to=fog", "?topic", "?topic="] {
         let (status, body) = admin.get(&format!("/v1/why{question}")).unwrap();
         assert_eq!(status, 400, "{question}: {body}");
-        check(
-            &serde_json::from_str::<Value>(&body).unwrap()["error"],
-            "code:s detail:s",
-        );
+        check(&serde_json::from_str::<Value>(&body).unwrap()["error"], "code:s detail:s");
     }
     for question in ["?topic=a//b", "?topic=imu/data&to=/", "?topic=%ff%00"] {
         let (status, body) = admin.get(&format!("/v1/why{question}")).unwrap();
@@ -181,25 +173,14 @@ fn why(admin: &Admin) {
     ] {
         let (status, body) = admin.get(path).unwrap();
         assert_eq!(status, 404, "{path}: {body}");
-        check(
-            &serde_json::from_str::<Value>(&body).unwrap()["error"],
-            "code:s detail:s",
-        );
+        check(&serde_json::from_str::<Value>(&body).unwrap()["error"], "code:s detail:s");
     }
 }
 
 #[test]
 fn every_answer_has_the_keys_of_the_contract() {
     let domain = format!("brokers.inter.dds.domain={}", free_domain().unwrap());
-    let arguments = [
-        "demo",
-        "--only",
-        "robot-1,fog-1",
-        "--duration",
-        "120s",
-        "--set",
-        &domain,
-    ];
+    let arguments = ["demo", "--only", "robot-1,fog-1", "--duration", "120s", "--set", &domain];
     let mut demo = Process::start("blaze", &arguments, None).unwrap();
     let robot = demo.node_ready("robot-1", DEADLINE).unwrap();
     let flows = || {
@@ -208,11 +189,8 @@ fn every_answer_has_the_keys_of_the_contract() {
         small["verdict"] == "flowing" && answer["verdict"] != "not_flowing" && !answer.is_null()
     };
     wait::until("messages flow", DEADLINE, flows, || demo.tail()).unwrap();
-    let rated = || {
-        robot
-            .json("/v1/allocation")
-            .is_ok_and(|answer| answer["wire_factor"].is_number())
-    };
+    let rated =
+        || robot.json("/v1/allocation").is_ok_and(|answer| answer["wire_factor"].is_number());
     wait::until("rates are measured", DEADLINE, rated, || demo.tail()).unwrap();
     topics(&robot);
     bridges(&robot);

@@ -12,7 +12,8 @@ use blaze_tests::wait;
 use super::random::Random;
 
 const DEADLINE: Duration = Duration::from_secs(20);
-/// After the storm the two must have found each other again; RustDDS alone repeats its announcements every 10 s.
+/// After the storm the two must have found each other again; RustDDS alone repeats its
+/// announcements every 10 s.
 const RECOVERY: Duration = Duration::from_secs(25);
 /// Datagrams of a storm; the full count with `--long`.
 const STORM: usize = 20_000;
@@ -25,21 +26,14 @@ fn udp_ports(process: &Process) -> BTreeSet<u16> {
         .unwrap()
         .filter_map(|entry| std::fs::read_link(entry.ok()?.path()).ok())
         .filter_map(|link| {
-            Some(
-                link.to_str()?
-                    .strip_prefix("socket:[")?
-                    .trim_end_matches(']')
-                    .to_owned(),
-            )
+            Some(link.to_str()?.strip_prefix("socket:[")?.trim_end_matches(']').to_owned())
         })
         .collect();
     let table = std::fs::read_to_string("/proc/net/udp").unwrap();
     let port = |line: &str| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let local = fields.get(1)?.rsplit(':').next()?;
-        inodes
-            .contains(*fields.get(9)?)
-            .then(|| u16::from_str_radix(local, 16).ok())?
+        inodes.contains(*fields.get(9)?).then(|| u16::from_str_radix(local, 16).ok())?
     };
     table.lines().skip(1).filter_map(port).collect()
 }
@@ -69,7 +63,8 @@ fn announcements(domain: u16) -> Vec<Vec<u8>> {
     heard
 }
 
-/// What RTPS knows, well formed but for its contents. Fragments, heartbeats and gaps have tests of their own.
+/// What RTPS knows, well formed but for its contents. Fragments, heartbeats and gaps have tests of
+/// their own.
 fn submessages(random: &mut Random) -> Vec<u8> {
     let mut datagram = b"RTPS\x02\x04\x01\x12".to_vec();
     datagram.extend(random.bytes(12));
@@ -140,9 +135,7 @@ fn garbage(random: &mut Random, heard: &[Vec<u8>]) -> Vec<u8> {
 /// Messages that left bridges towards a layer broker.
 fn delivered(admin: &Admin) -> f64 {
     let name = "blaze_flow_messages_total";
-    admin
-        .metric(name, &["topic=\"imu/data\"", "direction=\"out\"", "to=\"layer\""])
-        .unwrap_or(0.0)
+    admin.metric(name, &["topic=\"imu/data\"", "direction=\"out\"", "to=\"layer\""]).unwrap_or(0.0)
 }
 
 #[test]
@@ -156,7 +149,8 @@ fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
     let fog_admin = fog.node_ready("fog-1", DEADLINE).unwrap();
     let flow = |deadline, when: &str, fog: &Process| {
         let before = delivered(&fog_admin);
-        wait::until(when, deadline, || delivered(&fog_admin) >= before + 30.0, || fog.tail()).unwrap()
+        wait::until(when, deadline, || delivered(&fog_admin) >= before + 30.0, || fog.tail())
+            .unwrap()
     };
     flow(DEADLINE, "messages flow before", &fog);
     let heard = announcements(domain);
@@ -184,7 +178,9 @@ fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
     }
     let storm = begin.elapsed();
     let recovered = flow(RECOVERY, "messages flow again", &fog);
-    for (name, process, admin) in [("robot-1", &mut robot, &robot_admin), ("fog-1", &mut fog, &fog_admin)] {
+    for (name, process, admin) in
+        [("robot-1", &mut robot, &robot_admin), ("fog-1", &mut fog, &fog_admin)]
+    {
         assert!(process.runs(), "{}", process.tail());
         wait::until("ready", DEADLINE, || admin.ready(), || process.tail()).unwrap();
         let bytes = process.resident_bytes().unwrap();
@@ -192,17 +188,9 @@ fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
         let label = ["event=\"participant_rebuilt\""];
         let rebuilt = admin.metric("blaze_flow_link_events_total", &label);
         eprintln!("{name}: {} MiB, rebuilt {rebuilt:?}", bytes >> 20);
-        let deaths = process
-            .stderr()
-            .iter()
-            .filter(|line| line.contains("participant died"))
-            .count();
-        assert_eq!(
-            rebuilt,
-            Some(deaths as f64),
-            "each death is counted\n{}",
-            process.tail()
-        );
+        let deaths =
+            process.stderr().iter().filter(|line| line.contains("participant died")).count();
+        assert_eq!(rebuilt, Some(deaths as f64), "each death is counted\n{}", process.tail());
     }
     eprintln!(
         "{sent} datagrams to {} ports in {storm:?}; messages flowed again after {recovered:?}",

@@ -1,4 +1,5 @@
-//! What others make of the OpenAPI documents: clients in three languages, and requests by the thousand.
+//! What others make of the OpenAPI documents: clients in three languages, and requests by the
+//! thousand.
 
 use std::path::Path;
 use std::process::Command;

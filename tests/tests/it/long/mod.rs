@@ -1,4 +1,5 @@
-//! Tests that run with `scripts/test --long` alone: many workers at once, generated clients, the harness itself.
+//! Tests that run with `scripts/test --long` alone: many workers at once, generated clients, the
+//! harness itself.
 
 mod clients;
 mod fleet;

@@ -50,14 +50,9 @@ fn aborts_while_its_server_runs() {
 fn a_server_that_cannot_start_says_why_at_once() {
     let first = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
     let begin = Instant::now();
-    let taken = RedisOptions {
-        port: first.port(),
-        ..RedisOptions::default()
-    };
-    let faulty = RedisOptions {
-        extra: vec!["no-such-directive yes".to_owned()],
-        ..RedisOptions::default()
-    };
+    let taken = RedisOptions { port: first.port(), ..RedisOptions::default() };
+    let faulty =
+        RedisOptions { extra: vec!["no-such-directive yes".to_owned()], ..RedisOptions::default() };
     for (options, why) in [(taken, "in use"), (faulty, "no-such-directive")] {
         let error = RedisServer::start(RedisKind::Redis, options).err().expect("refused");
         assert!(error.to_string().contains(why), "{error}");

@@ -10,30 +10,15 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("blaze-proto", &["blaze-domain"]),
     ("blaze-runtime", &[]),
     ("blaze-auth", &["blaze-domain"]),
-    (
-        "blaze-config",
-        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-auth"],
-    ),
+    ("blaze-config", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-auth"]),
     ("blaze-brokers", &["blaze-domain", "blaze-proto", "blaze-runtime"]),
     (
         // A flow is a service of its node, too.
         "blaze-flow",
-        &[
-            "blaze-domain",
-            "blaze-proto",
-            "blaze-runtime",
-            "blaze-brokers",
-            "blaze-sdk",
-        ],
+        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers", "blaze-sdk"],
     ),
-    (
-        "blaze-worker",
-        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
-    ),
-    (
-        "blaze-sdk",
-        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
-    ),
+    ("blaze-worker", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),
+    ("blaze-sdk", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),
     (
         "blaze",
         &[
@@ -63,10 +48,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze",
         ],
     ),
-    (
-        "blaze-conformance",
-        &["blaze-domain", "blaze-proto", "blaze-brokers", "blaze-config"],
-    ),
+    ("blaze-conformance", &["blaze-domain", "blaze-proto", "blaze-brokers", "blaze-config"]),
     (
         "blaze-bench",
         &[

@@ -1,4 +1,5 @@
-//! Tests that run in every tier: simulations of whole flows, the SDK, and what is written about the code.
+//! Tests that run in every tier: simulations of whole flows, the SDK, and what is written about the
+//! code.
 
 mod flow;
 mod layers;

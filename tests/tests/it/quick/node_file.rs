@@ -12,7 +12,8 @@ const DOCUMENTATION: &str = include_str!("../../../../docs/node-file.md");
 const NOT_YET: &str = "not in effect in this version";
 
 fn load(file: impl Into<PathBuf>) -> Result<Loaded<NodeFile>, Vec<LocatedFault>> {
-    let remarks = |faults: Vec<Fault>| faults.into_iter().map(|fault| (fault.path, fault.detail)).collect();
+    let remarks =
+        |faults: Vec<Fault>| faults.into_iter().map(|fault| (fault.path, fault.detail)).collect();
     let schema: Schema<NodeFile> = Arc::new(move |tree| {
         let (file, warnings) = NodeFile::read(tree).map_err(remarks)?;
         match file.check_for_flow() {
@@ -51,11 +52,7 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
     let keys = |keys: &str| format!("{keys}: {NOT_YET}");
     assert_eq!(
         found,
-        [
-            (7, "brokers.plugins", NOT_YET),
-            (9, "admin", &keys("monitor")),
-            (21, "monitor", NOT_YET),
-        ]
+        [(7, "brokers.plugins", NOT_YET), (9, "admin", &keys("monitor")), (21, "monitor", NOT_YET),]
     );
 }
 
@@ -78,7 +75,11 @@ fn the_documentation_shows_that_example_and_one_without_a_warning() {
         let rules = loaded.value.flow.access.of(&topic.parse().unwrap());
         rules.allows(LeaseKind::Advertise, "edge", "robot-1", service)
     };
-    assert!(allows("cmd_vel", "joystick") && !allows("cmd_vel", "planner") && allows("imu/data", "planner"));
+    assert!(
+        allows("cmd_vel", "joystick")
+            && !allows("cmd_vel", "planner")
+            && allows("imu/data", "planner")
+    );
 }
 
 #[test]
@@ -86,11 +87,8 @@ fn a_fault_in_the_example_is_told_with_its_line() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("blaze.yaml");
     std::fs::write(&file, FIXTURE.replace("mtu: 1500", "mtu: 576")).unwrap();
-    let told: Vec<String> = load(file.clone())
-        .unwrap_err()
-        .iter()
-        .map(ToString::to_string)
-        .collect();
+    let told: Vec<String> =
+        load(file.clone()).unwrap_err().iter().map(ToString::to_string).collect();
     let line = "brokers.inter.dds.mtu: 576 is not a whole number from 1280 to 65535";
     assert_eq!(told, [format!("{}:6: {line}", file.display())]);
 }

@@ -1,4 +1,5 @@
-//! The table of `docs/design/traps.md` names tests that exist and run, and the earliest tier that runs one of each row.
+//! The table of `docs/design/traps.md` names tests that exist and run, and the earliest tier that
+//! runs one of each row.
 
 use std::path::Path;
 
@@ -12,20 +13,12 @@ struct Row {
 }
 
 fn rows() -> Vec<Row> {
-    let rows = TABLE
-        .lines()
-        .filter(|line| line.starts_with("| ") && !line.starts_with("| trap |"));
+    let rows = TABLE.lines().filter(|line| line.starts_with("| ") && !line.starts_with("| trap |"));
     rows.map(|row| {
         let cells: Vec<&str> = row.trim_matches('|').split('|').map(str::trim).collect();
-        let [trap, _, tier, tests] = cells[..] else {
-            panic!("four cells are expected: {row}")
-        };
+        let [trap, _, tier, tests] = cells[..] else { panic!("four cells are expected: {row}") };
         let names = tests.split(", ").map(|test| test.trim_matches('`'));
-        Row {
-            trap,
-            tier,
-            tests: names.map(|name| name.split_once(".rs::").unwrap()).collect(),
-        }
+        Row { trap, tier, tests: names.map(|name| name.split_once(".rs::").unwrap()).collect() }
     })
     .collect()
 }
@@ -54,16 +47,12 @@ fn every_trap_has_tests_that_run() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let rows = rows();
     assert!(rows.len() >= 15, "{} rows", rows.len());
-    for Row {
-        trap,
-        tier: stated,
-        tests,
-    } in rows
-    {
+    for Row { trap, tier: stated, tests } in rows {
         let mut tiers = Vec::new();
         for (file, name) in tests {
             let path = root.join(format!("{file}.rs"));
-            let code = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+            let code = std::fs::read_to_string(&path)
+                .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
             let lines: Vec<&str> = code.lines().collect();
             let at = lines.iter().position(|line| line.contains(&format!("fn {name}(")));
             let at = at.unwrap_or_else(|| panic!("{trap}: {} has no {name}", path.display()));
@@ -78,9 +67,7 @@ fn every_trap_has_tests_that_run() {
             assert!(!has("ignore"), "{trap}: {name} does not run");
             tiers.push(tier(file, &lines[..at]));
         }
-        let earliest = ["quick", "default", "long"]
-            .into_iter()
-            .find(|tier| tiers.contains(tier));
+        let earliest = ["quick", "default", "long"].into_iter().find(|tier| tiers.contains(tier));
         assert_eq!(Some(stated), earliest, "the tier of: {trap}");
     }
 }

@@ -1,5 +1,6 @@
-//! A service, a flow, a whole node and the flow of one of two consumers are killed and come back under their names, again and
-//! again: nothing comes twice, the other consumer misses nothing, and nothing of those who live on grows.
+//! A service, a flow, a whole node and the flow of one of two consumers are killed and come back
+//! under their names, again and again: nothing comes twice, the other consumer misses nothing, and
+//! nothing of those who live on grows.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -18,12 +19,9 @@ const STREAM: &str = "imu/data,reliable,50,320,10000";
 const WARM: u32 = 2;
 /// After RustDDS has lost a participant without a good-bye.
 const FORGOTTEN: Duration = Duration::from_secs(80);
-/// RustDDS remembers a participant that was killed for 50 s, so that the first minute of restarts adds to what is held.
-const MOST: Usage = Usage {
-    resident_kib: 12 * 1024,
-    threads: 2,
-    descriptors: 4,
-};
+/// RustDDS remembers a participant that was killed for 50 s, so that the first minute of restarts
+/// adds to what is held.
+const MOST: Usage = Usage { resident_kib: 12 * 1024, threads: 2, descriptors: 4 };
 
 /// A robot on a Redis of its own, a fog and a cloud on Kafka, and a service on each.
 struct System {
@@ -37,8 +35,14 @@ struct System {
 }
 
 /// A service on a node, on a broker named by its option, URL and prefix.
-fn probe(role: &str, (option, url, prefix): (&str, &str, &str), layer: &str, node: &str) -> anyhow::Result<Process> {
-    let mut arguments = vec![role, option, url, "--prefix", prefix, "--layer", layer, "--node", node];
+fn probe(
+    role: &str,
+    (option, url, prefix): (&str, &str, &str),
+    layer: &str,
+    node: &str,
+) -> anyhow::Result<Process> {
+    let mut arguments =
+        vec![role, option, url, "--prefix", prefix, "--layer", layer, "--node", node];
     arguments.extend(["--duration", "36000", "--topic", STREAM]);
     Process::tool("probe", &arguments, None)
 }
@@ -61,14 +65,10 @@ impl System {
         let prefixes = ["fog", "cloud"].map(|layer| format!("{run}.{layer}."));
         let of_layer = |at: usize, layer: &str, node: &str| {
             FlowProcess::launch(
-                FlowSpec::new(layer, node)
-                    .on_kafka(&kafka, &prefixes[at])
-                    .joined(domain),
+                FlowSpec::new(layer, node).on_kafka(&kafka, &prefixes[at]).joined(domain),
             )
         };
-        let robot = FlowSpec::new("edge", "robot-1")
-            .on_redis(&redis.url(), "")
-            .joined(domain);
+        let robot = FlowSpec::new("edge", "robot-1").on_redis(&redis.url(), "").joined(domain);
         let mut flows = [
             FlowProcess::launch(robot)?,
             of_layer(0, "fog", "fog-1")?,
@@ -193,14 +193,16 @@ fn whatever_comes_back_under_its_name_leaves_nothing_behind() -> anyhow::Result<
     }
     let (last, endpoints) = (system.fog.usage()?, system.endpoints()?);
     println!(
-        "{rounds} rounds: the fog's flow holds {last}, {endpoints} endpoints; after {WARM} it held {warm}, {known}"
+        "{rounds} rounds: the fog's flow holds {last}, {endpoints} endpoints; after {WARM} it held \
+         {warm}, {known}"
     );
     system.wait_heard()?;
     for ear in &system.ears {
         let faults = ["duplicated", "reordered"].map(|field| count(ear, field));
         anyhow::ensure!(faults == [0, 0], "twice and out of order: {faults:?}");
     }
-    // The lives of robot and cloud, and those that were killed within the time that RustDDS remembers them.
+    // The lives of robot and cloud, and those that were killed within the time that RustDDS
+    // remembers them.
     anyhow::ensure!(endpoints <= 2 + 3 * u64::from(rounds), "{endpoints} endpoints");
     if long() {
         wait::until(

@@ -1,5 +1,5 @@
-//! A second cloud flow comes to one that carries eight topics of unequal weight to a robot: they share them by measured load,
-//! and no message is lost, repeated or overtaken.
+//! A second cloud flow comes to one that carries eight topics of unequal weight to a robot: they
+//! share them by measured load, and no message is lost, repeated or overtaken.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -25,7 +25,8 @@ const STREAMS: [(usize, u32); 8] = [
     (2048, 20),
     (1024, 20),
 ];
-/// Until they have shared the topics: 5 s until the new one has settled, 13 s for each move, on a busy machine.
+/// Until they have shared the topics: 5 s until the new one has settled, 13 s for each move, on a
+/// busy machine.
 const EVEN_WITHIN: Duration = Duration::from_secs(120);
 /// So long nothing moves any more; simulations watch for longer.
 fn quiet() -> Duration {
@@ -73,18 +74,22 @@ fn a_second_flow_gets_its_share_of_the_load() -> anyhow::Result<()> {
     let run = unique_name("balance");
     let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
     let domain = free_domain()?;
-    let cloud = |node: &str| {
-        FlowSpec::new("cloud", node)
-            .on_kafka(&kafka, &kafka_prefix)
-            .joined(domain)
-    };
-    let robot = FlowSpec::new("edge", "robot-1")
-        .on_redis(&redis, &redis_prefix)
-        .joined(domain);
-    let (mut robot, mut first) = (FlowProcess::launch(robot)?, FlowProcess::launch(cloud("cloud-1"))?);
+    let cloud =
+        |node: &str| FlowSpec::new("cloud", node).on_kafka(&kafka, &kafka_prefix).joined(domain);
+    let robot = FlowSpec::new("edge", "robot-1").on_redis(&redis, &redis_prefix).joined(domain);
+    let (mut robot, mut first) =
+        (FlowProcess::launch(robot)?, FlowProcess::launch(cloud("cloud-1"))?);
     robot.wait_ready()?;
     first.wait_ready()?;
-    let lease = |op: &str, number: usize| json!({"op":op,"topic":topic(number),"service":"test","reliability":"reliable","ttl_s":0});
+    let lease = |op: &str, number: usize| {
+        json!({
+            "op":op,
+            "topic":topic(number),
+            "service":"test",
+            "reliability":"reliable",
+            "ttl_s":0,
+        })
+    };
     let writer = KafkaWriter::new(&kafka)?;
     for number in 0..STREAMS.len() {
         plain::tell_redis(&redis, &redis_prefix, &lease("request", number))?;
@@ -118,32 +123,25 @@ fn a_second_flow_gets_its_share_of_the_load() -> anyhow::Result<()> {
     let mut second = FlowProcess::launch(cloud("cloud-2"))?;
     second.wait_ready()?;
     let state = || {
-        format!(
-            "{:?} {:?}\n{}\n{}",
-            carried(&first),
-            carried(&second),
-            first.tail(),
-            second.tail()
-        )
+        format!("{:?} {:?}\n{}\n{}", carried(&first), carried(&second), first.tail(), second.tail())
     };
     let even = || {
         let (one, other) = (carried(&first), carried(&second));
         let (most, least) = (weight(&one).max(weight(&other)), weight(&one).min(weight(&other)));
-        one.len() + other.len() == STREAMS.len() && (most * 8 <= total * 5 || most - least <= 64 * 1024)
+        one.len() + other.len() == STREAMS.len()
+            && (most * 8 <= total * 5 || most - least <= 64 * 1024)
     };
     let took = wait::until("the load is shared", EVEN_WITHIN, even, state)?;
     let before = [moves(&first), moves(&second)];
     std::thread::sleep(quiet());
-    // Measured: not above a quarter more than the mean, give or take what a busy machine does to rates, once the mean of the
-    // last seconds has followed the moves.
+    // Measured: not above a quarter more than the mean, give or take what a busy machine does to
+    // rates, once the mean of the last seconds has followed the moves.
     let measured = || [out(&first), out(&second)];
     let is_even = || {
         let [one, other] = measured();
         one.max(other) * 10 <= (one + other) / 2 * 14
     };
-    wait::until("the measured loads are even", SOON, is_even, || {
-        format!("{:?}", measured())
-    })?;
+    wait::until("the measured loads are even", SOON, is_even, || format!("{:?}", measured()))?;
     println!(
         "even after {took:?}: moves {before:?}, weights {} and {}, measured {:?}",
         weight(&carried(&first)),
@@ -158,18 +156,11 @@ fn a_second_flow_gets_its_share_of_the_load() -> anyhow::Result<()> {
     );
     assert!(before[0][0] >= 1 && before[1][0] == 0, "{before:?}");
     let last = balance(&first)["last_move"].clone();
-    assert_eq!(
-        (&last["to"], &last["reason"]),
-        (&json!("cloud/cloud-2"), &json!("load")),
-        "{last}"
-    );
+    assert_eq!((&last["to"], &last["reason"]), (&json!("cloud/cloud-2"), &json!("load")), "{last}");
     for stream in &streams {
         let fate = stream.finish()?;
         let sent = fate.sent;
-        let whole = Fate {
-            sent,
-            ..Fate::default()
-        };
+        let whole = Fate { sent, ..Fate::default() };
         assert_eq!(fate, whole, "{}", state());
     }
     Ok(())

@@ -1,4 +1,5 @@
-//! Requests come and go, again and again, at the other end of a link: bridges come and go with them, and nothing grows.
+//! Requests come and go, again and again, at the other end of a link: bridges come and go with
+//! them, and nothing grows.
 
 use std::time::Duration;
 
@@ -17,11 +18,7 @@ const TOPICS: usize = 5;
 /// The share of the cycles after which everything that is made once has been made.
 const WARM: usize = 5;
 /// What the allocator of the system may hold on to.
-const MOST: Usage = Usage {
-    resident_kib: 6 * 1024,
-    threads: 1,
-    descriptors: 3,
-};
+const MOST: Usage = Usage { resident_kib: 6 * 1024, threads: 1, descriptors: 3 };
 
 fn topic(cycle: usize) -> String {
     format!("churn/t{}", cycle % TOPICS)
@@ -48,7 +45,13 @@ fn requests_that_come_and_go_leave_nothing_behind() -> anyhow::Result<()> {
     }
     let kafka = KafkaWriter::new(&system.kafka)?;
     let tell = |op: &str, cycle: usize| {
-        let message = json!({"op":op,"topic":topic(cycle),"service":"sink","reliability":"reliable","ttl_s":0});
+        let message = json!({
+            "op":op,
+            "topic":topic(cycle),
+            "service":"sink",
+            "reliability":"reliable",
+            "ttl_s":0,
+        });
         plain::tell_kafka(&kafka, &system.kafka_prefix, &message)
     };
     let on_both = |what: &str, expected: bool, cycle: usize| {
@@ -96,10 +99,7 @@ fn requests_that_come_and_go_leave_nothing_behind() -> anyhow::Result<()> {
     std::thread::sleep(Duration::from_secs(1));
     let last = usage(&system)?;
     for (flow, (warm, last)) in [&system.robot, &system.cloud].iter().zip(warm.iter().zip(&last)) {
-        println!(
-            "{cycles} cycles: {} holds {last}; after a fifth of them {warm}",
-            flow.spec.node
-        );
+        println!("{cycles} cycles: {} holds {last}; after a fifth of them {warm}", flow.spec.node);
         anyhow::ensure!(
             last.exceeds_by_at_most(warm, &MOST),
             "{} grew from {warm} to {last}",

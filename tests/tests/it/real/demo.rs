@@ -28,14 +28,15 @@ fn the_demo_runs_on_redis_and_kafka_with_the_same_verdict() -> anyhow::Result<()
         .map_err(|error| anyhow::anyhow!("{error}: {lines}\n{said}"))?;
     println!("{summary}");
     assert!(output.status.success(), "{summary}\n{said}");
-    assert_eq!(
-        (&summary["kind"], &summary["ok"]),
-        (&Value::from("summary"), &Value::from(true))
-    );
+    assert_eq!((&summary["kind"], &summary["ok"]), (&Value::from("summary"), &Value::from(true)));
     let topics = summary["topics"].as_array().cloned().unwrap_or_default();
     let to_cloud = topics
         .iter()
-        .find(|row| row["topic"] == "imu/data" && row["to"] == "cloud/cloud-1" && row["service"] == "recorder")
+        .find(|row| {
+            row["topic"] == "imu/data"
+                && row["to"] == "cloud/cloud-1"
+                && row["service"] == "recorder"
+        })
         .unwrap_or(&Value::Null);
     assert_eq!(
         to_cloud["route"],
@@ -45,10 +46,7 @@ fn the_demo_runs_on_redis_and_kafka_with_the_same_verdict() -> anyhow::Result<()
     // Over a worker on Redis.
     for document in ["service/analytics", "node/robot-1"] {
         let mut changes = summary["changes"].as_array().into_iter().flatten();
-        assert!(
-            changes.any(|change| change["document"] == document),
-            "{document}: {summary}"
-        );
+        assert!(changes.any(|change| change["document"] == document), "{document}: {summary}");
     }
     for row in topics.iter().filter(|row| row["topic"] != "camera/image_raw") {
         for count in ["lost", "duplicated", "reordered"] {

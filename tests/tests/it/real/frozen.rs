@@ -1,4 +1,5 @@
-//! A server, a flow or a reader stands still: nobody else notices, nothing piles up, nothing stale arrives afterwards.
+//! A server, a flow or a reader stands still: nobody else notices, nothing piles up, nothing stale
+//! arrives afterwards.
 
 use std::cell::RefCell;
 use std::io::Write as _;
@@ -9,7 +10,8 @@ use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::{self, KafkaWriter};
 use blaze_tests::process::Signal;
 use blaze_tests::servers::{
-    KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name,
+    KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis,
+    unique_name,
 };
 use blaze_tests::{wait, within};
 use serde_json::json;
@@ -29,7 +31,8 @@ const IN_THE_SOCKET: usize = 1024 * 1024;
 /// A flow may grow by this much while a server is frozen.
 const MAX_GROWTH_KIB: u64 = 96 * 1024;
 
-/// Robots, a fog and a cloud with streams between them: one over what freezes, the others beside it.
+/// Robots, a fog and a cloud with streams between them: one over what freezes, the others beside
+/// it.
 struct Rig {
     redis: RedisServer,
     kafka: KafkaServer,
@@ -37,12 +40,14 @@ struct Rig {
     frozen: Stream,
     /// Nothing in common with the frozen one but the machine.
     other: Stream,
-    /// From the same publisher's Redis and through the same flow as the frozen one, to another destination.
+    /// From the same publisher's Redis and through the same flow as the frozen one, to another
+    /// destination.
     sibling: Stream,
 }
 
 impl Rig {
-    /// `robot-1` and `cloud-1` on servers of their own, `robot-2` and `fog-1` on the shared ones; everybody joined.
+    /// `robot-1` and `cloud-1` on servers of their own, `robot-2` and `fog-1` on the shared ones;
+    /// everybody joined.
     fn start() -> anyhow::Result<Self> {
         let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default())?;
         let kafka = KafkaServer::start(KafkaOptions::default())?;
@@ -51,18 +56,10 @@ impl Rig {
         let domain = free_domain()?;
         let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
         let specs = [
-            FlowSpec::new("edge", "robot-1")
-                .on_redis(&redis.url(), "")
-                .joined(domain),
-            FlowSpec::new("cloud", "cloud-1")
-                .on_kafka(&kafka.bootstrap(), "")
-                .joined(domain),
-            FlowSpec::new("edge", "robot-2")
-                .on_redis(&other_redis, &redis_prefix)
-                .joined(domain),
-            FlowSpec::new("fog", "fog-1")
-                .on_kafka(&other_kafka, &kafka_prefix)
-                .joined(domain),
+            FlowSpec::new("edge", "robot-1").on_redis(&redis.url(), "").joined(domain),
+            FlowSpec::new("cloud", "cloud-1").on_kafka(&kafka.bootstrap(), "").joined(domain),
+            FlowSpec::new("edge", "robot-2").on_redis(&other_redis, &redis_prefix).joined(domain),
+            FlowSpec::new("fog", "fog-1").on_kafka(&other_kafka, &kafka_prefix).joined(domain),
         ];
         let mut flows = Vec::new();
         for spec in specs {
@@ -71,7 +68,8 @@ impl Rig {
         for flow in &mut flows {
             flow.wait_ready()?;
         }
-        let flows: [FlowProcess; 4] = flows.try_into().map_err(|_| anyhow::anyhow!("four flows"))?;
+        let flows: [FlowProcess; 4] =
+            flows.try_into().map_err(|_| anyhow::anyhow!("four flows"))?;
         // Two topics, so that each stream has one destination.
         connect_stream(&redis.url(), "", FROZEN, &kafka.bootstrap(), "")?;
         connect_stream(&redis.url(), "", SIBLING, &other_kafka, &kafka_prefix)?;
@@ -96,14 +94,7 @@ impl Rig {
         for stream in [&frozen, &other, &sibling] {
             stream.wait_fresh(SOON)?;
         }
-        Ok(Self {
-            redis,
-            kafka,
-            flows,
-            frozen,
-            other,
-            sibling,
-        })
+        Ok(Self { redis, kafka, flows, frozen, other, sibling })
     }
 
     fn memory(&self) -> anyhow::Result<Vec<u64>> {
@@ -111,11 +102,19 @@ impl Rig {
     }
 }
 
-fn connect_stream(redis: &str, redis_prefix: &str, topic: &str, kafka: &str, kafka_prefix: &str) -> anyhow::Result<()> {
-    let advertise = json!({"op":"advertise","topic":topic,"service":"source","rate_hz":50,"lifespan_ms":LIFESPAN.as_millis() as u64,
+fn connect_stream(
+    redis: &str,
+    redis_prefix: &str,
+    topic: &str,
+    kafka: &str,
+    kafka_prefix: &str,
+) -> anyhow::Result<()> {
+    let advertise = json!({"op":"advertise","topic":topic,"service":"source","rate_hz":50,"lifespan_ms":LIFESPAN
+        .as_millis() as u64,
         "reliability":"reliable","ttl_s":0});
     plain::tell_redis(redis, redis_prefix, &advertise)?;
-    let request = json!({"op":"request","topic":topic,"service":"sink","reliability":"reliable","ttl_s":0});
+    let request =
+        json!({"op":"request","topic":topic,"service":"sink","reliability":"reliable","ttl_s":0});
     plain::tell_kafka(&KafkaWriter::new(kafka)?, kafka_prefix, &request)
 }
 
@@ -124,8 +123,8 @@ fn period() -> Duration {
     Duration::from_secs(if blaze_tests::long() { 20 } else { 4 })
 }
 
-/// How often the comparison of latencies is made: a machine that is busy with something else for one of the two windows says
-/// nothing of the flow, which would hold up the other route each time.
+/// How often the comparison of latencies is made: a machine that is busy with something else for
+/// one of the two windows says nothing of the flow, which would hold up the other route each time.
 const ATTEMPTS: usize = 3;
 
 impl Rig {
@@ -142,7 +141,8 @@ impl Rig {
             let (thawed, times) = self.freeze_once(what, others, &freeze, &thaw)?;
             // The margin beside the factor is what the clock of two busy cores resolves.
             let margin = within(Duration::from_millis(5));
-            let as_fast = |(calm, frozen): &(Duration, Duration)| *frozen <= calm.mul_f64(1.2) + margin;
+            let as_fast =
+                |(calm, frozen): &(Duration, Duration)| *frozen <= calm.mul_f64(1.2) + margin;
             if times.iter().all(as_fast) {
                 return Ok(thawed);
             }
@@ -186,10 +186,7 @@ impl Rig {
         let times = times.collect();
         for (flow, (before, during)) in self.flows.iter().zip(before.iter().zip(&during)) {
             let node = &flow.spec.node;
-            assert!(
-                *during <= before + MAX_GROWTH_KIB,
-                "{what}, {node}: {before} → {during} KiB"
-            );
+            assert!(*during <= before + MAX_GROWTH_KIB, "{what}, {node}: {before} → {during} KiB");
         }
         Ok((thawed, times))
     }
@@ -207,7 +204,8 @@ fn stale(stream: &Stream, since: Instant) -> usize {
 fn dropped(flow: &FlowProcess, reasons: &[&str]) -> u64 {
     let bridges = flow.bridges();
     let of_frozen = bridges.iter().filter(|bridge| bridge["topic"] == FROZEN);
-    let counts = of_frozen.flat_map(|bridge| reasons.iter().map(|reason| bridge["dropped"][reason].as_u64()));
+    let counts = of_frozen
+        .flat_map(|bridge| reasons.iter().map(|reason| bridge["dropped"][reason].as_u64()));
     counts.flatten().sum()
 }
 
@@ -250,11 +248,6 @@ fn what_stands_still_holds_up_nobody_else() -> anyhow::Result<()> {
         robot.bridges()
     );
     rig.freeze("Redis", &others[..1], || rig.redis.freeze(), || rig.redis.thaw())?;
-    wait::until(
-        "robot-1 is ready again",
-        SOON,
-        || robot.admin().ready(),
-        || robot.tail(),
-    )?;
+    wait::until("robot-1 is ready again", SOON, || robot.admin().ready(), || robot.tail())?;
     Ok(())
 }

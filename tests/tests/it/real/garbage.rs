@@ -63,9 +63,7 @@ fn hostile_control() -> Vec<Vec<u8>> {
         b"{\"op\":\"advertise\"}".to_vec(),
         b"{\"op\":\"advertise\",\"topic\":1,\"service\":{}}".to_vec(),
         b"{\"op\":\"request\",\"topic\":\"a\",\"service\":\"s\",\"max_rate_hz\":1e999}".to_vec(),
-        json!({"op":"advertise","topic":"x".repeat(60_000),"service":"s"})
-            .to_string()
-            .into_bytes(),
+        json!({"op":"advertise","topic":"x".repeat(60_000),"service":"s"}).to_string().into_bytes(),
         vec![b'a'; 70_000],
         json!(vec![json!({"op":"fly"}); 201]).to_string().into_bytes(),
     ];
@@ -104,14 +102,15 @@ fn dropped(flow: &FlowProcess, reason: &str) -> f64 {
 
 /// Control messages that a flow refused.
 fn refused(flow: &FlowProcess) -> f64 {
-    metric_sum(
-        flow,
-        "blaze_flow_link_events_total",
-        "event=\"control_message_refused\"",
-    )
+    metric_sum(flow, "blaze_flow_link_events_total", "event=\"control_message_refused\"")
 }
 
-fn wait_count(what: &str, flow: &FlowProcess, count: impl Fn() -> f64, expected: f64) -> anyhow::Result<()> {
+fn wait_count(
+    what: &str,
+    flow: &FlowProcess,
+    count: impl Fn() -> f64,
+    expected: f64,
+) -> anyhow::Result<()> {
     let state = || format!("{} of {expected}\n{}", count(), flow.tail());
     wait::until(what, SOON, || count() >= expected, state)?;
     Ok(())
@@ -124,12 +123,7 @@ fn frames(robot: &FlowProcess, system: &RobotAndCloud) -> anyhow::Result<()> {
         system.publish(TOPIC, frame)?;
     }
     let count = || dropped(robot, "decode_error");
-    wait_count(
-        "every broken frame is counted",
-        robot,
-        count,
-        before + frames.len() as f64,
-    )
+    wait_count("every broken frame is counted", robot, count, before + frames.len() as f64)
 }
 
 /// One byte too many.
@@ -152,7 +146,11 @@ fn large_payloads(robot: &FlowProcess, system: &RobotAndCloud) -> anyhow::Result
 }
 
 /// Control messages on both brokers.
-fn control_messages(robot: &FlowProcess, system: &RobotAndCloud, writer: &KafkaWriter) -> anyhow::Result<()> {
+fn control_messages(
+    robot: &FlowProcess,
+    system: &RobotAndCloud,
+    writer: &KafkaWriter,
+) -> anyhow::Result<()> {
     const CONTROL: &str = "blaze/flow/control";
     let mut events = RedisReader::new(&system.redis, &system.channel("blaze/flow/events"))?;
     let (before, hostile) = (refused(robot), hostile_control());
@@ -164,7 +162,8 @@ fn control_messages(robot: &FlowProcess, system: &RobotAndCloud, writer: &KafkaW
     // An empty array alone has no fault.
     let expected = before + (hostile.len() - 1) as f64;
     wait_count("every refusal is counted", robot, || refused(robot), expected)?;
-    let is_told = |event: Value| event["event"] == "lease_refused" && event["code"] == "invalid_json";
+    let is_told =
+        |event: Value| event["event"] == "lease_refused" && event["code"] == "invalid_json";
     let told = || events.next_json(SOON).is_ok_and(is_told);
     wait::until("an event says so", SOON, told, || robot.tail())?;
     Ok(())
@@ -182,29 +181,18 @@ fn headers(system: &RobotAndCloud, channel: &str, writer: &KafkaWriter) -> anyho
         &[("blaze-writer", &id), ("blaze-sequence", b"0")],
         &[("blaze-writer", &id), ("blaze-sequence", b"-1")],
         &[("blaze-writer", &id)],
-        &[
-            ("blaze-writer", &id),
-            ("blaze-sequence", b"1"),
-            ("blaze-origin", &[b'/'; 9_000]),
-        ],
+        &[("blaze-writer", &id), ("blaze-sequence", b"1"), ("blaze-origin", &[b'/'; 9_000])],
     ];
     for headers in hostile {
         writer.produce_with(topic, b"payload", headers)?;
     }
     let count = || dropped(cloud, "decode_error");
-    wait_count(
-        "every hostile record is counted",
-        cloud,
-        count,
-        before + hostile.len() as f64,
-    )?;
-    // The writer of the hostile records is heard, and a record that names no writer is bare, whatever else it says.
+    wait_count("every hostile record is counted", cloud, count, before + hostile.len() as f64)?;
+    // The writer of the hostile records is heard, and a record that names no writer is bare,
+    // whatever else it says.
     let origin = b"cloud/cloud-1/planner/";
-    let good: &[(&str, &[u8])] = &[
-        ("blaze-writer", &id),
-        ("blaze-sequence", b"1"),
-        ("blaze-origin", origin),
-    ];
+    let good: &[(&str, &[u8])] =
+        &[("blaze-writer", &id), ("blaze-sequence", b"1"), ("blaze-origin", origin)];
     writer.produce_with(topic, b"good", good)?;
     writer.produce_with(topic, b"bare", &[("blaze-sequence", b"-1"), ("blaze-origin", b"\xff")])?;
     let mut found = Vec::new();

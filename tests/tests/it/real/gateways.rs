@@ -1,5 +1,5 @@
-//! Flows that are not on the inter scope and a robot outside: services on their nodes reach each other over a gateway, on Kafka
-//! and on DDS as the broker of the layer.
+//! Flows that are not on the inter scope and a robot outside: services on their nodes reach each
+//! other over a gateway, on Kafka and on DDS as the broker of the layer.
 
 use std::collections::BTreeSet;
 use std::thread::JoinHandle;
@@ -34,7 +34,8 @@ impl Way {
     /// Leases on both sides.
     fn new(redis: &str, topic: &str, from: &str, to: &str) -> anyhow::Result<Self> {
         for (prefix, op) in [(from, "advertise"), (to, "request")] {
-            let lease = json!({"op":op,"topic":topic,"service":"test","reliability":"reliable","ttl_s":0});
+            let lease =
+                json!({"op":op,"topic":topic,"service":"test","reliability":"reliable","ttl_s":0});
             plain::tell_redis(redis, prefix, &lease)?;
         }
         Ok(Self {
@@ -45,7 +46,8 @@ impl Way {
         })
     }
 
-    /// Publishes until a message comes through, then so many of which each must come once and in order.
+    /// Publishes until a message comes through, then so many of which each must come once and in
+    /// order.
     fn run(&mut self) -> anyhow::Result<()> {
         let mut reader = RedisReader::new(&self.redis, &self.to)?;
         let mut connection = connect(&self.redis)?;
@@ -66,10 +68,7 @@ impl Way {
             for count in 0..MESSAGES {
                 let due = begin + PERIOD * u32::try_from(count)?;
                 std::thread::sleep(due.saturating_duration_since(Instant::now()));
-                redis::cmd("PUBLISH")
-                    .arg(&channel)
-                    .arg(first + count)
-                    .exec(&mut connection)?;
+                redis::cmd("PUBLISH").arg(&channel).arg(first + count).exec(&mut connection)?;
             }
             Ok(())
         });
@@ -84,7 +83,8 @@ impl Way {
         }
         publisher.join().expect("it does not panic")?;
         let expected: Vec<u64> = (first..first + MESSAGES).collect();
-        let lost: BTreeSet<&u64> = expected.iter().filter(|number| !came.contains(number)).collect();
+        let lost: BTreeSet<&u64> =
+            expected.iter().filter(|number| !came.contains(number)).collect();
         anyhow::ensure!(came == expected, "{}: lost {lost:?}, came {came:?}", self.from);
         Ok(())
     }
@@ -112,9 +112,7 @@ fn over_a_gateway(layer: impl Fn(FlowSpec) -> FlowSpec) -> anyhow::Result<()> {
     let prefix = |node: &str| format!("{run}:{node}:");
     let domain = free_domain()?;
     let spec = |layer: &str, node: &str| {
-        FlowSpec::new(layer, node)
-            .on_redis(&redis, &prefix(node))
-            .joined(domain)
+        FlowSpec::new(layer, node).on_redis(&redis, &prefix(node)).joined(domain)
     };
     let setting = |spec: FlowSpec, gateway: bool| FlowSpec {
         kind: "edge".to_owned(),
@@ -140,24 +138,16 @@ fn over_a_gateway(layer: impl Fn(FlowSpec) -> FlowSpec) -> anyhow::Result<()> {
     for way in &mut ways {
         way.run()?;
     }
-    assert_eq!(
-        (heard_by(&robot), heard_by(&member)),
-        (names(&["site/gateway"]), names(&[]))
-    );
+    assert_eq!((heard_by(&robot), heard_by(&member)), (names(&["site/gateway"]), names(&[])));
     assert_eq!(peers(&member)["gateway"]["stage"], "member");
     assert_eq!(peers(&gateway)["gateway"]["gateways"], json!(["site/gateway"]));
-    for (flow, topic, to) in [
-        (&member, TO_ROBOT, "edge"),
-        (&member, TO_MEMBER, "site"),
-        (&robot, TO_MEMBER, "site"),
-    ] {
+    for (flow, topic, to) in
+        [(&member, TO_ROBOT, "edge"), (&member, TO_MEMBER, "site"), (&robot, TO_MEMBER, "site")]
+    {
         let why = flow.why(topic, Some(to))?;
         let steps = why["steps"].as_array().cloned().unwrap_or_default();
         assert_eq!(why["verdict"], "flowing", "{topic} to {to}: {why}");
-        assert!(
-            steps.iter().any(|step| step["flow"] == "site/gateway"),
-            "{topic} to {to}: {why}"
-        );
+        assert!(steps.iter().any(|step| step["flow"] == "site/gateway"), "{topic} to {to}: {why}");
     }
     Ok(())
 }
@@ -178,7 +168,8 @@ mod long {
     use super::*;
 
     #[test]
-    fn of_seventeen_flows_four_are_gateways_and_one_that_is_killed_is_replaced() -> anyhow::Result<()> {
+    fn of_seventeen_flows_four_are_gateways_and_one_that_is_killed_is_replaced()
+    -> anyhow::Result<()> {
         let (redis, kafka) = (shared_redis()?, shared_kafka()?);
         let run = unique_name("gateways");
         let domain = free_domain()?;
@@ -188,13 +179,11 @@ mod long {
             let spec = FlowSpec::new("cloud", &node).on_kafka(&kafka, &format!("{run}."));
             spec.on_redis(&redis, &prefix(&node)).joined(domain)
         };
-        let robot = FlowSpec::new("edge", "robot")
-            .on_redis(&redis, &prefix("robot"))
-            .joined(domain);
+        let robot =
+            FlowSpec::new("edge", "robot").on_redis(&redis, &prefix("robot")).joined(domain);
         let mut robot = FlowProcess::launch(robot)?;
-        let mut clouds: Vec<FlowProcess> = (1..=17)
-            .map(|number| FlowProcess::launch(cloud(number)))
-            .collect::<Result<_, _>>()?;
+        let mut clouds: Vec<FlowProcess> =
+            (1..=17).map(|number| FlowProcess::launch(cloud(number))).collect::<Result<_, _>>()?;
         robot.wait_ready()?;
         for flow in &mut clouds {
             flow.wait_ready()?;
@@ -211,7 +200,8 @@ mod long {
             || format!("{:?}", heard_by(&robot)),
         )?;
         let gateways = heard_by(&robot);
-        let is_member = |flow: &&FlowProcess| !gateways.contains(&format!("cloud/{}", flow.spec.node));
+        let is_member =
+            |flow: &&FlowProcess| !gateways.contains(&format!("cloud/{}", flow.spec.node));
         let member = clouds.iter().find(is_member).expect("13 of 17").spec.node.clone();
         let mut ways = [
             Way::new(&redis, TO_MEMBER, &prefix("robot"), &prefix(&member))?,
@@ -221,9 +211,8 @@ mod long {
             way.run()?;
         }
         let killed: BTreeSet<String> = gateways.iter().take(1).cloned().collect();
-        let victim = clouds
-            .iter_mut()
-            .find(|flow| killed.contains(&format!("cloud/{}", flow.spec.node)));
+        let victim =
+            clouds.iter_mut().find(|flow| killed.contains(&format!("cloud/{}", flow.spec.node)));
         victim.expect("it is one of them").kill()?;
         let since = Instant::now();
         wait::until(
@@ -232,11 +221,7 @@ mod long {
             || four(&killed),
             || format!("{:?}", heard_by(&robot)),
         )?;
-        println!(
-            "replaced after {:?}: {gateways:?}, then {:?}",
-            since.elapsed(),
-            heard_by(&robot)
-        );
+        println!("replaced after {:?}: {gateways:?}, then {:?}", since.elapsed(), heard_by(&robot));
         for way in &mut ways {
             way.run()?;
         }

@@ -1,5 +1,6 @@
-//! Late joiners over brokers and link: who asks for what is kept gets the last of every live writer, who does not gets nothing
-//! of it. And the quality of service of the first who came does not stick.
+//! Late joiners over brokers and link: who asks for what is kept gets the last of every live
+//! writer, who does not gets nothing of it. And the quality of service of the first who came does
+//! not stick.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
@@ -10,8 +11,8 @@ use blaze_brokers::{Broker, Health, Role, open_layer, open_node};
 use blaze_domain::node_file::{KafkaBroker, LayerBroker, NodeBroker, RedisBroker};
 use blaze_domain::{Durability, Reliability, Scope, TopicName};
 use blaze_sdk::{
-    Advertise, Lease, PublishOptions, Publisher, Request, ServiceManager, ServiceOptions, SubscribeOptions,
-    Subscription,
+    Advertise, Lease, PublishOptions, Publisher, Request, ServiceManager, ServiceOptions,
+    SubscribeOptions, Subscription,
 };
 use blaze_tests::servers::{shared_kafka, shared_redis};
 use blaze_tests::wait;
@@ -35,7 +36,8 @@ async fn service(
 ) -> anyhow::Result<ServiceManager> {
     let mut status = broker.status();
     tokio::time::timeout(SOON, status.wait_for(|status| status.health == Health::Up)).await??;
-    let options = ServiceOptions::new(layer.parse()?, name.parse()?, broker, scope).on_node(node.parse()?);
+    let options =
+        ServiceOptions::new(layer.parse()?, name.parse()?, broker, scope).on_node(node.parse()?);
     Ok(ServiceManager::start(options).await?)
 }
 
@@ -126,12 +128,7 @@ impl Listener {
             let _ = tell.try_send(String::from_utf8_lossy(message.payload()).into_owned());
         };
         let subscription = service.broker().subscribe(&topic, options, hear).await?;
-        Ok(Self {
-            heard,
-            _service: service,
-            _lease: lease,
-            _subscription: subscription,
-        })
+        Ok(Self { heard, _service: service, _lease: lease, _subscription: subscription })
     }
 
     /// What it hears within the time that is enough, sorted; then nothing more comes.
@@ -155,42 +152,29 @@ fn late_joiners_get_the_last_of_every_live_writer() -> anyhow::Result<()> {
 
 async fn late_joiners() -> anyhow::Result<()> {
     let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
-    let (lidar, camera) = (
-        Mapper::start(&system, "lidar").await?,
-        Mapper::start(&system, "camera").await?,
-    );
+    let (lidar, camera) =
+        (Mapper::start(&system, "lidar").await?, Mapper::start(&system, "camera").await?);
     // Before anybody asks for it anywhere.
     for number in 1..=3 {
         lidar.publish(&format!("lidar {number}"));
         camera.publish(&format!("camera {number}"));
     }
-    let first = Listener::start(on_cloud(&system, "first").await?, Durability::TransientLocal).await?;
-    assert_eq!(
-        first.hears(2)?,
-        ["camera 3", "lidar 3"],
-        "the first who joins late, over the link"
-    );
-    let second = Listener::start(on_cloud(&system, "second").await?, Durability::TransientLocal).await?;
-    assert_eq!(
-        second.hears(2)?,
-        ["camera 3", "lidar 3"],
-        "the second one gets both writers, too"
-    );
-    let beside = Listener::start(on_robot(&system, "beside").await?, Durability::TransientLocal).await?;
-    assert_eq!(
-        beside.hears(2)?,
-        ["camera 3", "lidar 3"],
-        "on the publishers' own broker"
-    );
-    let volatile = Listener::start(on_cloud(&system, "volatile").await?, Durability::Volatile).await?;
+    let first =
+        Listener::start(on_cloud(&system, "first").await?, Durability::TransientLocal).await?;
+    assert_eq!(first.hears(2)?, ["camera 3", "lidar 3"], "the first who joins late, over the link");
+    let second =
+        Listener::start(on_cloud(&system, "second").await?, Durability::TransientLocal).await?;
+    assert_eq!(second.hears(2)?, ["camera 3", "lidar 3"], "the second one gets both writers, too");
+    let beside =
+        Listener::start(on_robot(&system, "beside").await?, Durability::TransientLocal).await?;
+    assert_eq!(beside.hears(2)?, ["camera 3", "lidar 3"], "on the publishers' own broker");
+    let volatile =
+        Listener::start(on_cloud(&system, "volatile").await?, Durability::Volatile).await?;
     assert!(volatile.heard.recv_timeout(SILENCE).is_err(), "volatile is volatile");
     lidar.publish("lidar 4");
-    for (listener, name) in [
-        (&first, "first"),
-        (&second, "second"),
-        (&beside, "beside"),
-        (&volatile, "volatile"),
-    ] {
+    for (listener, name) in
+        [(&first, "first"), (&second, "second"), (&beside, "beside"), (&volatile, "volatile")]
+    {
         assert_eq!(listener.hears(1)?, ["lidar 4"], "{name}");
     }
     // What a writer that has gone had kept is of no use any more.
@@ -207,7 +191,8 @@ async fn late_joiners() -> anyhow::Result<()> {
         || kept().is_ok_and(|writers| writers == 1),
         || format!("{:?} writers, {}", kept(), system.robot.tail()),
     )?;
-    let third = Listener::start(on_robot(&system, "third").await?, Durability::TransientLocal).await?;
+    let third =
+        Listener::start(on_robot(&system, "third").await?, Durability::TransientLocal).await?;
     assert_eq!(third.hears(1)?, ["lidar 4"], "of live writers only");
     lidar.end().await;
     Ok(())
@@ -228,17 +213,15 @@ fn the_quality_of_the_first_does_not_stick() -> anyhow::Result<()> {
         )
     };
     let lane_is = |what: &str, reliable: bool, lifespan_ms: u32| -> anyhow::Result<()> {
-        let found = || {
-            system
-                .robot
-                .bridges()
-                .into_iter()
-                .find(|bridge| bridge["topic"] == TOPIC)
-        };
+        let found = || system.robot.bridges().into_iter().find(|bridge| bridge["topic"] == TOPIC);
         wait::until(
             what,
             SOON,
-            || found().is_some_and(|bridge| bridge["reliable"] == reliable && bridge["lifespan_ms"] == lifespan_ms),
+            || {
+                found().is_some_and(|bridge| {
+                    bridge["reliable"] == reliable && bridge["lifespan_ms"] == lifespan_ms
+                })
+            },
             || format!("{:?}", found()),
         )?;
         Ok(())

@@ -31,7 +31,8 @@ impl Numbered {
         mut listen: impl FnMut() -> Option<(Identity, Vec<u8>)> + Send + 'static,
     ) -> Self {
         let log = Arc::<Mutex<Ledger>>::default();
-        let (publishing, listening) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicBool::new(true)));
+        let (publishing, listening) =
+            (Arc::new(AtomicBool::new(true)), Arc::new(AtomicBool::new(true)));
         let (kept, goes_on) = (Arc::clone(&log), Arc::clone(&listening));
         let sink = std::thread::spawn(move || {
             while goes_on.load(Ordering::Relaxed) {
@@ -56,12 +57,7 @@ impl Numbered {
                 std::thread::sleep(next.saturating_duration_since(Instant::now()));
             }
         });
-        Self {
-            log,
-            publishing,
-            listening,
-            threads: vec![sink, source],
-        }
+        Self { log, publishing, listening, threads: vec![sink, source] }
     }
 
     /// From a topic of Kafka to a channel of Redis.

@@ -46,34 +46,25 @@ fn check_headers(record: &Record) {
     assert_eq!(record.header("blaze-hops"), "2", "one on the link, one on Kafka");
     assert_eq!(record.header("blaze-reliable"), "true");
     let writer = record.header("blaze-writer");
-    assert!(
-        writer.len() == 32 && writer.bytes().all(|b| b.is_ascii_hexdigit()),
-        "{writer}"
-    );
+    assert!(writer.len() == 32 && writer.bytes().all(|b| b.is_ascii_hexdigit()), "{writer}");
     assert_eq!(String::from_utf8_lossy(&record.key), writer);
     assert!(
-        record
-            .header("blaze-time")
-            .parse::<u64>()
-            .is_ok_and(|ns| ns > 1_700_000_000_000_000_000)
+        record.header("blaze-time").parse::<u64>().is_ok_and(|ns| ns > 1_700_000_000_000_000_000)
     );
-    assert!(
-        record
-            .header("blaze-age-us")
-            .parse::<u64>()
-            .is_ok_and(|us| us < 10_000_000)
-    );
+    assert!(record.header("blaze-age-us").parse::<u64>().is_ok_and(|us| us < 10_000_000));
     assert!(!record.header("blaze-epoch").is_empty());
 }
 
-/// Who may publish a command is a matter of the node file: refused ones are told, shown, and carry nothing.
+/// Who may publish a command is a matter of the node file: refused ones are told, shown, and carry
+/// nothing.
 #[test]
 fn commands_come_only_from_whom_the_rules_allow() -> anyhow::Result<()> {
     const TOPIC: &str = "cmd_vel";
     let redis = shared_redis()?;
     let prefix = format!("{}:", unique_name("access"));
     let mut spec = FlowSpec::new("edge", "robot-1").on_redis(&redis, &prefix);
-    spec.flow = "access: [ { match: cmd_vel, advertise: { allow: [ \"edge/*/joystick\" ] } } ]".to_owned();
+    spec.flow =
+        "access: [ { match: cmd_vel, advertise: { allow: [ \"edge/*/joystick\" ] } } ]".to_owned();
     let mut flow = FlowProcess::launch(spec)?;
     flow.wait_ready()?;
     let mut connection = connect(&redis)?;
@@ -90,11 +81,7 @@ fn commands_come_only_from_whom_the_rules_allow() -> anyhow::Result<()> {
                "id": service, "reply_to": "blaze/reply/test"})
         .to_string()
     };
-    assert_eq!(
-        tell("blaze/flow/control", &op("request", "motor"))?,
-        1,
-        "the flow alone hears it"
-    );
+    assert_eq!(tell("blaze/flow/control", &op("request", "motor"))?, 1, "the flow alone hears it");
     let answer = answers.next_json(SOON).with_context(|| flow.tail())?;
     assert_eq!(answer["ok"], true, "{answer}");
     tell("blaze/flow/control", &op("advertise", "planner"))?;
@@ -143,12 +130,7 @@ mod quick {
         wait::until(
             "the advertise is known and the request is missing",
             SOON,
-            || {
-                system
-                    .robot
-                    .why(TOPIC, None)
-                    .is_ok_and(|why| code(&why).1 == "no_request")
-            },
+            || system.robot.why(TOPIC, None).is_ok_and(|why| code(&why).1 == "no_request"),
             || format!("{:?}", system.robot.why(TOPIC, None)),
         )?;
         system
@@ -156,22 +138,20 @@ mod quick {
         let reader = KafkaReader::from_end(&system.kafka, &system.topic(TOPIC))?;
         system.robot.wait_bridge(TOPIC, SOON)?;
         system.cloud.wait_bridge(TOPIC, SOON)?;
-        // The pair stands on both sides; the first message may still meet a bridge that has just been made.
+        // The pair stands on both sides; the first message may still meet a bridge that has just
+        // been made.
         let first = until_the_first_arrives(&system, &reader)?;
         let mut connection = connect(&system.redis)?;
         for number in 1..=MESSAGES {
             let payload = format!("{{\"n\":{number}}}");
-            redis::cmd("PUBLISH")
-                .arg(system.channel(TOPIC))
-                .arg(payload)
-                .exec(&mut connection)?;
+            redis::cmd("PUBLISH").arg(system.channel(TOPIC)).arg(payload).exec(&mut connection)?;
         }
         let mut last_sequence = first.header("blaze-sequence").parse::<u64>()?;
         let mut number = 0;
         while number < MESSAGES {
-            let record = reader
-                .next(SOON)
-                .ok_or_else(|| anyhow::anyhow!("{number} of {MESSAGES} arrived: {}", system.cloud.tail()))?;
+            let record = reader.next(SOON).ok_or_else(|| {
+                anyhow::anyhow!("{number} of {MESSAGES} arrived: {}", system.cloud.tail())
+            })?;
             let Some(found) = numbered(&record) else { continue };
             number += 1;
             assert_eq!(found, number, "in order and once");
@@ -193,10 +173,7 @@ mod quick {
             || system.robot.bridges_up().is_empty(),
             || format!("{:?}", system.robot.bridges()),
         )?;
-        redis::cmd("PUBLISH")
-            .arg(system.channel(TOPIC))
-            .arg("{\"n\":0}")
-            .exec(&mut connection)?;
+        redis::cmd("PUBLISH").arg(system.channel(TOPIC)).arg("{\"n\":0}").exec(&mut connection)?;
         assert_eq!(
             reader.next(Duration::from_millis(700)),
             None,
@@ -204,11 +181,7 @@ mod quick {
             withdrawn.elapsed()
         );
         let after = system.robot.why(TOPIC, None)?;
-        assert_eq!(
-            code(&after),
-            ("not_flowing".to_owned(), "no_request".to_owned()),
-            "{after}"
-        );
+        assert_eq!(code(&after), ("not_flowing".to_owned(), "no_request".to_owned()), "{after}");
         Ok(())
     }
 
@@ -217,13 +190,23 @@ mod quick {
     fn a_kafka_producer_reaches_a_bare_redis_subscriber() -> anyhow::Result<()> {
         const COMMANDS: &str = "fleet/commands";
         let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
-        system.tell_cloud(
-            &json!({"op":"advertise","topic":COMMANDS,"service":"planner","reliability":"reliable","ttl_s":0}),
-        )?;
-        system.tell_robot(
-            &json!({"op":"request","topic":COMMANDS,"service":"driver","bare":true,"reliability":"reliable","ttl_s":0}),
-        )?;
-        let mut reader = RedisReader::new(&system.redis, &system.channel("blaze/bare/fleet/commands"))?;
+        system.tell_cloud(&json!({
+            "op":"advertise",
+            "topic":COMMANDS,
+            "service":"planner",
+            "reliability":"reliable",
+            "ttl_s":0,
+        }))?;
+        system.tell_robot(&json!({
+            "op":"request",
+            "topic":COMMANDS,
+            "service":"driver",
+            "bare":true,
+            "reliability":"reliable",
+            "ttl_s":0,
+        }))?;
+        let mut reader =
+            RedisReader::new(&system.redis, &system.channel("blaze/bare/fleet/commands"))?;
         let mut framed = RedisReader::new(&system.redis, &system.channel(COMMANDS))?;
         system.cloud.wait_bridge(COMMANDS, SOON)?;
         system.robot.wait_bridge(COMMANDS, SOON)?;
@@ -259,11 +242,7 @@ mod quick {
                 "bare, in order and once"
             );
         }
-        assert_eq!(
-            framed.next(Duration::from_millis(200))?,
-            None,
-            "nobody asked for frames"
-        );
+        assert_eq!(framed.next(Duration::from_millis(200))?, None, "nobody asked for frames");
         Ok(())
     }
 }

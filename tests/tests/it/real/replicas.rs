@@ -1,5 +1,5 @@
-//! Two cloud flows on one Kafka and a robot on Redis, joined over DDS on loopback: whoever carries a topic is killed or
-//! stopped under 50 Hz both ways.
+//! Two cloud flows on one Kafka and a robot on Redis, joined over DDS on loopback: whoever carries
+//! a topic is killed or stopped under 50 Hz both ways.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -25,8 +25,8 @@ const BYTES: usize = 250;
 const ON_THE_WAY: Duration = Duration::from_millis(300);
 /// The flows hear a control message at the same time, give or take this.
 const SECOND_ANSWER: Duration = Duration::from_millis(500);
-/// A replica that is stopped may be missed for so long, on a busy machine: a place that was not handed over would be missed for
-/// as long as one that was killed. 20 to 210 ms were seen.
+/// A replica that is stopped may be missed for so long, on a busy machine: a place that was not
+/// handed over would be missed for as long as one that was killed. 20 to 210 ms were seen.
 fn stopped_gap() -> Duration {
     Duration::from_secs(if blaze_tests::long() { 1 } else { 2 })
 }
@@ -36,7 +36,8 @@ fn killed_gap() -> Duration {
     Duration::from_secs(if blaze_tests::long() { 3 } else { 5 })
 }
 
-/// What happened to the messages that were published between two moments, or were on their way at the first.
+/// What happened to the messages that were published between two moments, or were on their way at
+/// the first.
 fn judge(way: &Numbered, from: Instant, to: Instant) -> (Fate, Duration) {
     let log = way.log.lock();
     (log.fate(|_, at| at + ON_THE_WAY >= from && at < to), log.gap(from, to))
@@ -57,26 +58,27 @@ impl System {
         let run = unique_name("replicas");
         let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
         let domain = free_domain()?;
-        let robot = FlowSpec::new("edge", "robot-1")
-            .on_redis(&redis, &redis_prefix)
-            .joined(domain);
+        let robot = FlowSpec::new("edge", "robot-1").on_redis(&redis, &redis_prefix).joined(domain);
         let cloud = |node: &str| {
-            FlowSpec::new("cloud", node)
-                .on_kafka(&kafka, &kafka_prefix)
-                .joined(domain)
+            FlowSpec::new("cloud", node).on_kafka(&kafka, &kafka_prefix).joined(domain)
         };
         let mut robot = FlowProcess::launch(robot)?;
-        let mut clouds = vec![
-            FlowProcess::launch(cloud("cloud-1"))?,
-            FlowProcess::launch(cloud("cloud-2"))?,
-        ];
+        let mut clouds =
+            vec![FlowProcess::launch(cloud("cloud-1"))?, FlowProcess::launch(cloud("cloud-2"))?];
         robot.wait_ready()?;
         for flow in &mut clouds {
             flow.wait_ready()?;
         }
         let topic = |name: &str| format!("{kafka_prefix}{}", name.replace('/', "."));
-        let lease =
-            |op: &str, topic: &str| json!({"op":op,"topic":topic,"service":"test","reliability":"reliable","ttl_s":0});
+        let lease = |op: &str, topic: &str| {
+            json!({
+                "op":op,
+                "topic":topic,
+                "service":"test",
+                "reliability":"reliable",
+                "ttl_s":0,
+            })
+        };
         let mut connection = connect(&redis)?;
         for message in [lease("advertise", UP), lease("request", DOWN)] {
             plain::tell_redis(&redis, &redis_prefix, &message)?;
@@ -86,19 +88,13 @@ impl System {
             plain::tell_kafka(&writer, &kafka_prefix, &message)?;
         }
         let up = {
-            let (reader, channel) = (
-                KafkaReader::from_end(&kafka, &topic(UP))?,
-                format!("{redis_prefix}{UP}"),
-            );
+            let (reader, channel) =
+                (KafkaReader::from_end(&kafka, &topic(UP))?, format!("{redis_prefix}{UP}"));
             Numbered::start(
                 PERIOD,
                 BYTES,
                 move |payload| {
-                    redis::cmd("PUBLISH")
-                        .arg(&channel)
-                        .arg(payload)
-                        .exec(&mut connection)
-                        .is_ok()
+                    redis::cmd("PUBLISH").arg(&channel).arg(payload).exec(&mut connection).is_ok()
                 },
                 move || {
                     let record = reader.next(Duration::from_millis(50))?;
@@ -109,14 +105,7 @@ impl System {
         };
         let channel = format!("{redis_prefix}{DOWN}");
         let down = Numbered::from_kafka((&kafka, topic(DOWN)), (&redis, &channel), PERIOD, BYTES)?;
-        let system = Self {
-            kafka,
-            kafka_prefix,
-            robot,
-            clouds,
-            up,
-            down,
-        };
+        let system = Self { kafka, kafka_prefix, robot, clouds, up, down };
         let now = Instant::now();
         system.up.wait_fresh(now, "robot to cloud")?;
         system.down.wait_fresh(now, "cloud to robot")?;
@@ -126,7 +115,8 @@ impl System {
     /// Which replicas carry the topic to the robot.
     fn carriers(&self) -> Vec<usize> {
         let start = format!("{DOWN}|layer>inter|edge");
-        let carries = |flow: &FlowProcess| flow.bridges_up().iter().any(|id| id.starts_with(&start));
+        let carries =
+            |flow: &FlowProcess| flow.bridges_up().iter().any(|id| id.starts_with(&start));
         (0..self.clouds.len()).filter(|at| carries(&self.clouds[*at])).collect()
     }
 
@@ -147,19 +137,13 @@ impl System {
     /// The replica that the robot sends to.
     fn receiver(&self) -> anyhow::Result<usize> {
         let to = |bridge: &Value| {
-            let up = bridge["state"] == "up" && bridge["topic"] == UP && bridge["to"]["scope"] == "inter";
+            let up = bridge["state"] == "up"
+                && bridge["topic"] == UP
+                && bridge["to"]["scope"] == "inter";
             up.then(|| bridge["to"]["flow"].as_str().unwrap_or_default().to_owned())
         };
-        let flow = self
-            .robot
-            .bridges()
-            .iter()
-            .find_map(to)
-            .context("the robot sends to nobody")?;
-        let at = self
-            .clouds
-            .iter()
-            .position(|cloud| flow == format!("cloud/{}", cloud.spec.node));
+        let flow = self.robot.bridges().iter().find_map(to).context("the robot sends to nobody")?;
+        let at = self.clouds.iter().position(|cloud| flow == format!("cloud/{}", cloud.spec.node));
         at.with_context(|| format!("the robot sends to {flow}"))
     }
 
@@ -168,11 +152,8 @@ impl System {
         let flow = format!("cloud/{node}");
         let sees = |other: &FlowProcess| {
             let peers = other.admin().json("/v1/peers").unwrap_or_default();
-            let row = peers["replicas"]
-                .as_array()
-                .into_iter()
-                .flatten()
-                .find(|row| row["flow"] == flow);
+            let row =
+                peers["replicas"].as_array().into_iter().flatten().find(|row| row["flow"] == flow);
             row.is_some_and(|row| row["settled"] == true)
         };
         wait::until(
@@ -212,7 +193,8 @@ fn answers_come_once(system: &System) -> anyhow::Result<()> {
     let reader = KafkaReader::from_end(&system.kafka, &topic("reply"))?;
     let writer = KafkaWriter::new(&system.kafka)?;
     for number in 0..MESSAGES {
-        let message = json!({"op":"request","topic":"some/thing","service":format!("s{number}"),"id":number.to_string(),
+        let message = json!({"op":"request","topic":"some/thing","service":format!("s{number}"),"id":number
+            .to_string(),
             "reply_to":"blaze/reply/test-0"});
         plain::tell_kafka(&writer, &system.kafka_prefix, &message)?;
     }
@@ -225,10 +207,7 @@ fn answers_come_once(system: &System) -> anyhow::Result<()> {
         by.entry(text("id")).or_default().push(text("flow"));
         anyhow::ensure!(Instant::now() < until, "answers do not end: {by:?}");
     }
-    anyhow::ensure!(
-        by.len() == MESSAGES && by.values().all(|flows| flows.len() == 1),
-        "{by:?}"
-    );
+    anyhow::ensure!(by.len() == MESSAGES && by.values().all(|flows| flows.len() == 1), "{by:?}");
     let flows: BTreeSet<&String> = by.values().flatten().collect();
     anyhow::ensure!(flows.len() == system.clouds.len(), "only {flows:?} ever answer");
     Ok(())
@@ -259,7 +238,8 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
         End::Killed => system.clouds[at].kill()?,
         End::Stopped => system.clouds[at].terminate()?,
     }
-    // What is published from here on has to come: whoever carried it before is known to be gone by then.
+    // What is published from here on has to come: whoever carried it before is known to be gone by
+    // then.
     let over = match end {
         End::Killed => Duration::from_millis(3500),
         End::Stopped => Duration::from_millis(1500),
@@ -273,7 +253,8 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
         let (found, gap) = judge(way, from, to);
         let again = found.repeats - repeats;
         println!(
-            "{end:?} {victim:?} {node}: {name}: sent {} lost {} repeats {again} doubled {} reordered {} gap {:?}",
+            "{end:?} {victim:?} {node}: {name}: sent {} lost {} repeats {again} doubled {} \
+             reordered {} gap {:?}",
             found.sent, found.lost, found.twice, found.reordered, gap
         );
         let fault = || format!("{end:?} {victim:?} {name}: {found:?}\n{}", system.tails());
@@ -318,16 +299,17 @@ fn who_carries_is_told(system: &System) -> anyhow::Result<()> {
             let name = format!("cloud/{}", system.clouds[carrier].spec.node);
             let why = cloud.why(DOWN, None).unwrap_or_default();
             let steps = why["steps"].as_array().cloned().unwrap_or_default();
-            let not_owner = steps
-                .iter()
-                .any(|step| step["code"] == "not_owner" && step["ok"] == true);
+            let not_owner =
+                steps.iter().any(|step| step["code"] == "not_owner" && step["ok"] == true);
             let listed = cloud.admin().json("/v1/bridges").unwrap_or_default();
             let elsewhere = listed["not_owner"]
                 .as_array()
                 .into_iter()
                 .flatten()
                 .any(|row| row["topic"] == DOWN && row["owner"] == name.as_str());
-            why["verdict"] == "flowing" && not_owner == (at != carrier) && elsewhere == (at != carrier)
+            why["verdict"] == "flowing"
+                && not_owner == (at != carrier)
+                && elsewhere == (at != carrier)
         };
         wait::until("who carries the topic is told", SOON, told, || {
             format!("{:?} {:?}", cloud.why(DOWN, None), cloud.admin().json("/v1/bridges"))
@@ -347,7 +329,8 @@ fn a_replica_that_goes_is_replaced() -> anyhow::Result<()> {
         (End::Stopped, Victim::Carrier),
         (End::Killed, Victim::Receiver),
     ];
-    // A hand-over on a real Kafka is also what `real/balance.rs` tests, and who receives is not up to a server.
+    // A hand-over on a real Kafka is also what `real/balance.rs` tests, and who receives is not up
+    // to a server.
     let (rounds, ends) = if blaze_tests::long() { (10, 4) } else { (1, 2) };
     for number in 1..=rounds {
         println!("round {number}");

@@ -23,11 +23,8 @@ fn leases(flow: &FlowProcess) -> Vec<String> {
     let mut found = Vec::new();
     for row in answer["topics"].as_array().into_iter().flatten() {
         for kind in ["advertised", "requested"] {
-            for lease in row[kind]
-                .as_array()
-                .into_iter()
-                .flatten()
-                .filter(|lease| lease["local"] == true)
+            for lease in
+                row[kind].as_array().into_iter().flatten().filter(|lease| lease["local"] == true)
             {
                 found.push(format!(
                     "{kind} {} {} {}",
@@ -101,7 +98,10 @@ fn whatever_is_killed_comes_back() -> anyhow::Result<()> {
     }
     let last = settled_memory(&system)?;
     let first = first_memory.unwrap_or(last);
-    println!("resident KiB of robot and cloud flow: {first:?} after the first round, {last:?} after the last");
+    println!(
+        "resident KiB of robot and cloud flow: {first:?} after the first round, {last:?} after the \
+         last"
+    );
     let (twice, reordered) = stream.faults();
     let arrivals = stream.arrivals().len() as u64;
     println!(
@@ -120,7 +120,8 @@ fn whatever_is_killed_comes_back() -> anyhow::Result<()> {
 /// Resident memory of both flows; in the long run after a minute of quiet.
 fn settled_memory(system: &RobotAndCloud) -> anyhow::Result<[u64; 2]> {
     if blaze_tests::long() {
-        // The figure is asked a minute after the restart: this is the measurement itself, not a wait for something.
+        // The figure is asked a minute after the restart: this is the measurement itself, not a
+        // wait for something.
         std::thread::sleep(Duration::from_secs(60));
     }
     Ok([system.robot.rss_kib()?, system.cloud.rss_kib()?])
@@ -152,7 +153,7 @@ fn kill_and_restart(
             }
         }
     }
-    stream
-        .wait_fresh(within(FLOWING))
-        .map_err(|error| anyhow::anyhow!("{victim:?}: {error}\n{}\n{}", system.robot.tail(), system.cloud.tail()))
+    stream.wait_fresh(within(FLOWING)).map_err(|error| {
+        anyhow::anyhow!("{victim:?}: {error}\n{}\n{}", system.robot.tail(), system.cloud.tail())
+    })
 }

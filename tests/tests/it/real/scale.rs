@@ -1,4 +1,5 @@
-//! Thousands of topics on one flow: what they cost in memory, traffic and time, all of them bridged to another flow.
+//! Thousands of topics on one flow: what they cost in memory, traffic and time, all of them bridged
+//! to another flow.
 
 use std::time::{Duration, Instant};
 
@@ -70,11 +71,10 @@ fn thousands_of_topics_on_one_flow() -> anyhow::Result<()> {
     let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default())?;
     let (url, fog_url) = (redis.url(), shared_valkey()?);
     let (domain, fog_prefix) = (free_domain()?, format!("{}:", unique_name("scale")));
-    let mut robot = FlowProcess::launch(FlowSpec::new("edge", "robot-1").on_redis(&url, "").joined(domain))?;
+    let mut robot =
+        FlowProcess::launch(FlowSpec::new("edge", "robot-1").on_redis(&url, "").joined(domain))?;
     let mut fog = FlowProcess::launch(
-        FlowSpec::new("fog", "fog-1")
-            .on_redis(&fog_url, &fog_prefix)
-            .joined(domain),
+        FlowSpec::new("fog", "fog-1").on_redis(&fog_url, &fog_prefix).joined(domain),
     )?;
     robot.wait_ready()?;
     fog.wait_ready()?;
@@ -87,15 +87,7 @@ fn thousands_of_topics_on_one_flow() -> anyhow::Result<()> {
         "all topics are bridged",
         BRIDGED,
         || all(&robot) && all(&fog),
-        || {
-            format!(
-                "{} and {} of {topics}\n{}\n{}",
-                up(&robot),
-                up(&fog),
-                robot.tail(),
-                fog.tail()
-            )
-        },
+        || format!("{} and {} of {topics}\n{}\n{}", up(&robot), up(&fog), robot.tail(), fog.tail()),
     )?;
     let took = begin.elapsed();
     let after = [robot.usage()?, fog.usage()?];
@@ -112,7 +104,8 @@ fn thousands_of_topics_on_one_flow() -> anyhow::Result<()> {
         let rate = (control_bytes(flow)? - counted[index]) / seconds;
         let busy = (flow.cpu()? - cpu[index]).as_secs_f64() / seconds;
         println!(
-            "{topics} topics, bridged after {took:.1?}: {} holds {}, before {}; idle: {rate:.0} control bytes/s, {:.1} % of a core",
+            "{topics} topics, bridged after {took:.1?}: {} holds {}, before {}; idle: {rate:.0} \
+             control bytes/s, {:.1} % of a core",
             flow.spec.node,
             after[index],
             before[index],

@@ -27,12 +27,8 @@ impl RobotAndCloud {
         let run = unique_name("real");
         let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
         let domain = free_domain()?;
-        let robot = FlowSpec::new("edge", "robot-1")
-            .on_redis(redis, &redis_prefix)
-            .joined(domain);
-        let cloud = FlowSpec::new("cloud", "cloud-1")
-            .on_kafka(kafka, &kafka_prefix)
-            .joined(domain);
+        let robot = FlowSpec::new("edge", "robot-1").on_redis(redis, &redis_prefix).joined(domain);
+        let cloud = FlowSpec::new("cloud", "cloud-1").on_kafka(kafka, &kafka_prefix).joined(domain);
         let (mut robot, mut cloud) = (FlowProcess::launch(robot)?, FlowProcess::launch(cloud)?);
         robot.wait_ready()?;
         cloud.wait_ready()?;

@@ -53,7 +53,8 @@ async fn nothing_is_missing_from_the_memory_of_one_that_is_alone() {
     let reader = Arc::new(store(&server).await);
     let (acknowledged, ended) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
     let reading = {
-        let (reader, acknowledged, ended) = (Arc::clone(&reader), Arc::clone(&acknowledged), Arc::clone(&ended));
+        let (reader, acknowledged, ended) =
+            (Arc::clone(&reader), Arc::clone(&acknowledged), Arc::clone(&ended));
         std::thread::spawn(move || {
             let (mut alone, mut asked) = (0_u64, 0_u64);
             while !ended.load(Ordering::SeqCst) {
@@ -77,10 +78,7 @@ async fn nothing_is_missing_from_the_memory_of_one_that_is_alone() {
         let head = writer.head().await.unwrap();
         assert_eq!(head, 2 * (round - 1));
         for revision in [head + 1, head + 2] {
-            writer
-                .commit(&[record(revision, &format!("w{revision}"))])
-                .await
-                .unwrap();
+            writer.commit(&[record(revision, &format!("w{revision}"))]).await.unwrap();
             acknowledged.store(revision, Ordering::SeqCst);
         }
         writer.close().await;

@@ -1,5 +1,5 @@
-//! Migrations of both kinds of stores: killed at every point they go on where they were, by several at once, and from the
-//! first schema.
+//! Migrations of both kinds of stores: killed at every point they go on where they were, by several
+//! at once, and from the first schema.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -12,7 +12,9 @@ use blaze_config::store::migrate::{Action, Migration, Migrations, Step};
 use blaze_config::store::{AuditQuery, FullStore, MongoStore, Op, SqliteStore, StoreError};
 use blaze_domain::config::{Document, Key, Timestamp};
 use blaze_runtime::Supervisor;
-use blaze_tests::servers::{drop_mongo_database, mongo_command, mongo_insert, shared_mongo, unique_name};
+use blaze_tests::servers::{
+    drop_mongo_database, mongo_command, mongo_insert, shared_mongo, unique_name,
+};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -35,7 +37,8 @@ struct Home {
 
 async fn open(place: &str, migrations: &Migrations) -> Result<Arc<dyn FullStore>, StoreError> {
     if place.contains('/') {
-        let store = SqliteStore::open_with(Path::new(place), migrations, &Supervisor::new("test")).await?;
+        let store =
+            SqliteStore::open_with(Path::new(place), migrations, &Supervisor::new("test")).await?;
         return Ok(Arc::new(store));
     }
     let store = MongoStore::open_with(&shared_mongo().unwrap(), place, migrations).await?;
@@ -45,17 +48,11 @@ async fn open(place: &str, migrations: &Migrations) -> Result<Arc<dyn FullStore>
 impl Home {
     fn file() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        Self {
-            place: folder.path().join("store.db").display().to_string(),
-            folder: Some(folder),
-        }
+        Self { place: folder.path().join("store.db").display().to_string(), folder: Some(folder) }
     }
 
     fn database() -> Self {
-        Self {
-            place: unique_name("migrate"),
-            folder: None,
-        }
+        Self { place: unique_name("migrate"), folder: None }
     }
 
     fn is_file(&self) -> bool {
@@ -87,24 +84,21 @@ impl Home {
             "--nocapture",
             "stores::migrations::migrates_and_dies",
         ]);
-        victim
-            .env(VICTIM, &self.place)
-            .env(VICTIM_DIES, at)
-            .stdin(Stdio::null());
+        victim.env(VICTIM, &self.place).env(VICTIM_DIES, at).stdin(Stdio::null());
         if !self.is_file() {
             victim.env("BLAZE_TEST_MONGODB_URI", shared_mongo().unwrap());
         }
         let output = victim.output().unwrap();
         let text = String::from_utf8_lossy(&output.stdout);
         let faults = String::from_utf8_lossy(&output.stderr);
-        assert!(
-            text.contains("migrating") && !output.status.success(),
-            "{at}: {text}{faults}"
-        );
+        assert!(text.contains("migrating") && !output.status.success(), "{at}: {text}{faults}");
         if !self.is_file() {
             // A lease whose holder was killed runs out; tests do not wait for that.
             self.command(&json!({ "update": "meta", "updates": [
-                { "q": { "_id": "lease" }, "u": { "$set": { "until": { "$date": { "$numberLong": "0" } } } } },
+                {
+                    "q": { "_id": "lease" },
+                    "u": { "$set": { "until": { "$date": { "$numberLong": "0" } } } },
+                },
             ] }));
         }
     }
@@ -121,14 +115,8 @@ impl Drop for Home {
 
 /// A migration for tests: a table, a rewriting of all documents, another table.
 fn further() -> Migration {
-    let step = |name: &'static str, action: Action| Step {
-        name: Cow::Borrowed(name),
-        action,
-    };
-    let rewrite = || Action::Rewrite {
-        text: Cow::Borrowed("mark"),
-        function: mark,
-    };
+    let step = |name: &'static str, action: Action| Step { name: Cow::Borrowed(name), action };
+    let rewrite = || Action::Rewrite { text: Cow::Borrowed("mark"), function: mark };
     let sql = |text: &'static str| Action::Sql(Cow::Borrowed(text));
     let command = |text: &'static str| Action::Command(Cow::Borrowed(text));
     Migration {
@@ -176,9 +164,8 @@ async fn migrates_and_dies() {
     if let Ok(documents) = at.parse() {
         LEFT.store(documents, Ordering::Relaxed);
     }
-    let migrations = Migrations::default()
-        .and([further()])
-        .after_step(Arc::new(move |label: &str| {
+    let migrations =
+        Migrations::default().and([further()]).after_step(Arc::new(move |label: &str| {
             if label == at {
                 std::process::abort();
             }
@@ -225,7 +212,8 @@ async fn goes_on_when_killed(home: Home) {
         pending -= done;
         assert_eq!(home.pending(&migrations).await.len(), pending, "{at}");
     }
-    // A program of before goes on, as `min_version` did not rise; on a database it was there all the time.
+    // A program of before goes on, as `min_version` did not rise; on a database it was there all
+    // the time.
     if home.is_file() {
         before = home.open(&own).await.unwrap();
     }
@@ -243,7 +231,8 @@ async fn goes_on_when_killed(home: Home) {
 async fn several_that_start_at_once_migrate_once() {
     let home = Home::database();
     let migrations = Migrations::default().and([further()]);
-    let (a, b, c) = tokio::join!(home.open(&migrations), home.open(&migrations), home.open(&migrations));
+    let (a, b, c) =
+        tokio::join!(home.open(&migrations), home.open(&migrations), home.open(&migrations));
     let stores = [a.unwrap(), b.unwrap(), c.unwrap()];
     let mut ids = Vec::new();
     for store in &stores {
@@ -296,12 +285,11 @@ async fn schema_1_is_read_and_migrated(home: &Home) {
         assert_eq!((snapshot.revision, snapshot.floor), (5, 2));
         assert_eq!(snapshot.store_id, "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d11");
         let documents = snapshot.documents.iter();
-        let mut keys: Vec<String> = documents.clone().map(|document| document.key.to_string()).collect();
+        let mut keys: Vec<String> =
+            documents.clone().map(|document| document.key.to_string()).collect();
         keys.sort();
         assert_eq!(keys, ["Instance/slam/0", "Layer/edge", "Service/slam"]);
-        let slam = documents
-            .clone()
-            .find(|document| document.key.to_string() == "Service/slam");
+        let slam = documents.clone().find(|document| document.key.to_string() == "Service/slam");
         let slam = slam.unwrap();
         assert_eq!(slam.spec["config"]["camera"]["rate_hz"], json!(15));
         assert_eq!(slam.labels["site"], "lab");
@@ -317,10 +305,7 @@ async fn schema_1_is_read_and_migrated(home: &Home) {
         assert_eq!(held, ["Node/robot-1"]);
         if home.is_file() {
             // A database gives no entry that is older than it keeps them.
-            let query = AuditQuery {
-                limit: 10,
-                ..AuditQuery::default()
-            };
+            let query = AuditQuery { limit: 10, ..AuditQuery::default() };
             assert_eq!(store.audit(&query).await.unwrap().len(), 2);
         }
         let begin = Timestamp::from_millis(0);

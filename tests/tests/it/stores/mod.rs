@@ -1,4 +1,5 @@
-//! The stores of the configuration: the rules for all of them, outages, processes that are killed, migrations.
+//! The stores of the configuration: the rules for all of them, outages, processes that are killed,
+//! migrations.
 //!
 //! Needs `scripts/services install`.
 

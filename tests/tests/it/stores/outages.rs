@@ -27,20 +27,11 @@ async fn a_killed_server_shows_at_once_and_comes_back() {
         server.kill().unwrap();
         head_is_unavailable(&store).await;
         let begin = Instant::now();
-        let error = store
-            .commit(&[record(store_head(&ledger) + 1, "lost")])
-            .await
-            .unwrap_err();
-        assert!(
-            matches!(error, CommitError::NotWritten(StoreError::Unavailable(_))),
-            "{error}"
-        );
+        let error = store.commit(&[record(store_head(&ledger) + 1, "lost")]).await.unwrap_err();
+        assert!(matches!(error, CommitError::NotWritten(StoreError::Unavailable(_))), "{error}");
         assert!(begin.elapsed() < Duration::from_secs(11), "{:?}", begin.elapsed());
         server.restart().unwrap();
-        println!(
-            "written {:?} after the restart",
-            write_through(&store, &mut ledger).await
-        );
+        println!("written {:?} after the restart", write_through(&store, &mut ledger).await);
         // Who follows hears of it again.
         let head = store.head().await.unwrap();
         let begin = Instant::now();
@@ -83,15 +74,13 @@ async fn a_server_that_stands_still_is_unavailable_and_goes_on() {
         }
         assert!(begin.elapsed() < Duration::from_secs(20), "{:?}", begin.elapsed());
         server.thaw().unwrap();
-        println!(
-            "written {:?} after it goes on",
-            write_through(&store, &mut ledger).await
-        );
+        println!("written {:?} after it goes on", write_through(&store, &mut ledger).await);
     }
     check(&store, &ledger).await;
 }
 
-/// A server that stands still long enough for its connections to be given up still reads what was sent before.
+/// A server that stands still long enough for its connections to be given up still reads what was
+/// sent before.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_was_sent_to_a_server_that_stands_still_is_not_refused() {
     let server = server();
@@ -104,7 +93,8 @@ async fn what_was_sent_to_a_server_that_stands_still_is_not_refused() {
         server.freeze().unwrap();
         let group = [record(revision, &batch)];
         let (told, ()) = tokio::join!(store.commit(&group), async {
-            // Longer than the driver waits for a sign of life (3 s), shorter than a commit is tried (10 s).
+            // Longer than the driver waits for a sign of life (3 s), shorter than a commit is tried
+            // (10 s).
             tokio::time::sleep(Duration::from_millis(3_500 + 400 * round)).await;
             server.thaw().unwrap();
         });
@@ -112,7 +102,9 @@ async fn what_was_sent_to_a_server_that_stands_still_is_not_refused() {
         match told {
             Ok(()) => ledger.insert(batch, Told::Yes),
             Err(CommitError::Unknown(_)) => ledger.insert(batch, Told::Unknown),
-            Err(CommitError::Conflict | CommitError::NotWritten(_)) => ledger.insert(batch, Told::No),
+            Err(CommitError::Conflict | CommitError::NotWritten(_)) => {
+                ledger.insert(batch, Told::No)
+            }
         };
         // What may have been written has to be looked at before memory counts.
         if ledger.values().any(|told| *told == Told::Unknown) {

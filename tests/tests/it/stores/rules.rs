@@ -22,11 +22,7 @@ struct Databases {
 
 impl Databases {
     fn new(in_a_hurry: bool) -> Self {
-        Self {
-            in_a_hurry,
-            uri: shared_mongo().unwrap(),
-            made: Mutex::new(Vec::new()),
-        }
+        Self { in_a_hurry, uri: shared_mongo().unwrap(), made: Mutex::new(Vec::new()) }
     }
 }
 
@@ -61,10 +57,7 @@ struct Files {
 
 impl Files {
     fn new() -> Self {
-        Self {
-            folder: tempfile::tempdir().unwrap(),
-            supervisor: Supervisor::new("test"),
-        }
+        Self { folder: tempfile::tempdir().unwrap(), supervisor: Supervisor::new("test") }
     }
 }
 
@@ -107,7 +100,10 @@ async fn documents_follow_the_log_when_it_was_set_back() {
             store.commit(&[record]).await.unwrap();
         }
         // As a majority does that was lost, or a snapshot of the disk.
-        let gone = serde_json::json!({ "delete": "events", "deletes": [{ "q": { "_id": 3 }, "limit": 1 }] });
+        let gone = serde_json::json!({
+            "delete": "events",
+            "deletes": [{ "q": { "_id": 3 }, "limit": 1 }],
+        });
         mongo_command(&databases.uri, &name, &gone).unwrap();
         store.tidy().await.unwrap();
         let other = MongoStore::open(&databases.uri, &name).await.unwrap();

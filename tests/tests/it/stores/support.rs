@@ -33,20 +33,11 @@ pub(crate) fn record(revision: u64, batch: &str) -> CommitRecord {
         request_id: batch.to_owned(),
         changes,
     };
-    CommitRecord {
-        commit: Arc::new(commit),
-        audit: Vec::new(),
-        idempotency: None,
-    }
+    CommitRecord { commit: Arc::new(commit), audit: Vec::new(), idempotency: None }
 }
 
 fn change(op: Op, document: Document, previous: Option<u64>) -> Change {
-    Change {
-        op,
-        document: Arc::new(document),
-        previous,
-        paths: Vec::new(),
-    }
+    Change { op, document: Arc::new(document), previous, paths: Vec::new() }
 }
 
 fn document(key: &str, revision: u64) -> Document {
@@ -89,7 +80,10 @@ async fn write_one(store: &(impl CommitLog + ?Sized), ledger: &mut Ledger) -> Op
 }
 
 /// Writes until a commit is acknowledged. How long that took.
-pub(crate) async fn write_through(store: &(impl CommitLog + ?Sized), ledger: &mut Ledger) -> Duration {
+pub(crate) async fn write_through(
+    store: &(impl CommitLog + ?Sized),
+    ledger: &mut Ledger,
+) -> Duration {
     let begin = Instant::now();
     while write_one(store, ledger).await != Some(Told::Yes) {
         assert!(begin.elapsed() < Duration::from_secs(60), "nothing can be written");
@@ -98,8 +92,8 @@ pub(crate) async fn write_through(store: &(impl CommitLog + ?Sized), ledger: &mu
     begin.elapsed()
 }
 
-/// What was told is what is there: yes is in the log, no is not, unknown may be; nothing else is in it, and no revision is
-/// missing. Documents and log say the same.
+/// What was told is what is there: yes is in the log, no is not, unknown may be; nothing else is in
+/// it, and no revision is missing. Documents and log say the same.
 pub(crate) async fn check(store: &(impl CommitLog + ?Sized), ledger: &Ledger) {
     let mut commits: Vec<Commit> = Vec::new();
     loop {
@@ -110,18 +104,17 @@ pub(crate) async fn check(store: &(impl CommitLog + ?Sized), ledger: &Ledger) {
         }
         commits.extend(batch.commits);
     }
-    let there: BTreeMap<&str, u64> = commits
-        .iter()
-        .map(|commit| (commit.batch.as_str(), commit.revision))
-        .collect();
+    let there: BTreeMap<&str, u64> =
+        commits.iter().map(|commit| (commit.batch.as_str(), commit.revision)).collect();
     assert_eq!(there.len(), commits.len(), "a batch is there twice");
     for (batch, told) in ledger {
         match told {
-            Told::Yes => assert!(
-                there.contains_key(batch.as_str()),
-                "{batch} was acknowledged and is lost"
-            ),
-            Told::No => assert!(!there.contains_key(batch.as_str()), "{batch} was refused and is there"),
+            Told::Yes => {
+                assert!(there.contains_key(batch.as_str()), "{batch} was acknowledged and is lost")
+            }
+            Told::No => {
+                assert!(!there.contains_key(batch.as_str()), "{batch} was refused and is there")
+            }
             Told::Unknown => {}
         }
     }

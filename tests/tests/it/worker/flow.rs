@@ -1,5 +1,5 @@
-//! BlazeFlow takes its own settings from the worker of its node: what counts, what is refused, who else hears, and what
-//! follows while messages flow.
+//! BlazeFlow takes its own settings from the worker of its node: what counts, what is refused, who
+//! else hears, and what follows while messages flow.
 
 use std::time::{Duration, Instant};
 
@@ -23,7 +23,11 @@ fn spec(stage: &Stage, node: &str) -> FlowSpec {
 
 /// The layer as `Stage::robot` makes it, with overrides for the flow.
 fn layer(flow: &Value) -> Value {
-    json!({ "kind": "edge", "config": { "verbosity": "info" }, "overrides": { "blaze-flow": flow } })
+    json!({
+        "kind": "edge",
+        "config": { "verbosity": "info" },
+        "overrides": { "blaze-flow": flow },
+    })
 }
 
 fn limit(limit_mbps: f64) -> Value {
@@ -31,7 +35,12 @@ fn limit(limit_mbps: f64) -> Value {
 }
 
 /// Waits until `/v1/allocation` satisfies.
-fn allocates(flow: &FlowProcess, what: &str, within: Duration, is_so: impl Fn(&Value) -> bool) -> Duration {
+fn allocates(
+    flow: &FlowProcess,
+    what: &str,
+    within: Duration,
+    is_so: impl Fn(&Value) -> bool,
+) -> Duration {
     let ask = || flow.admin().json("/v1/allocation").unwrap_or_default();
     wait::until(what, within, || is_so(&ask()), || format!("{} {}", ask(), flow.tail())).unwrap()
 }
@@ -98,22 +107,15 @@ async fn is_configured(worker: &Worker) {
 async fn a_limit_of_layer_or_node_is_in_effect_within_a_second_and_nobody_else_hears() {
     let stage = Stage::new();
     // The flow first, for once: it is ready without a worker, and finds the one that comes.
-    let mut flow = FlowProcess::start(FlowSpec {
-        limit_mbps: 30.0,
-        ..spec(&stage, "robot-1")
-    })
-    .unwrap();
+    let mut flow =
+        FlowProcess::start(FlowSpec { limit_mbps: 30.0, ..spec(&stage, "robot-1") }).unwrap();
     has_limit(&flow, 30.0, PATIENCE);
     let _main = stage.main();
     stage.robot().await;
     let worker = stage.worker("robot-1");
     stage.equal(&worker, PATIENCE).await;
     is_configured(&worker).await;
-    let record = stage
-        .keys()
-        .record("blaze:watchdog:blaze-flow:robot-1:0")
-        .await
-        .unwrap();
+    let record = stage.keys().record("blaze:watchdog:blaze-flow:robot-1:0").await.unwrap();
     let record = record.expect("the flow shows that it lives");
     assert_eq!((record["state"].as_str(), record["layer"].as_str()), ("ready", "edge"));
 
@@ -149,11 +151,7 @@ async fn a_limit_of_layer_or_node_is_in_effect_within_a_second_and_nobody_else_h
 
     flow.terminate().unwrap();
     assert_eq!(flow.exit(PATIENCE).unwrap(), Some(0), "{}", flow.tail());
-    let gone = stage
-        .keys()
-        .record("blaze:watchdog:blaze-flow:robot-1:0")
-        .await
-        .unwrap();
+    let gone = stage.keys().record("blaze:watchdog:blaze-flow:robot-1:0").await.unwrap();
     assert!(gone.is_none(), "a flow that ends takes its sign of life away: {gone:?}");
     worker.stop();
 }
@@ -166,20 +164,22 @@ async fn what_the_flow_cannot_take_changes_nothing_and_says_so() {
     let worker = stage.worker("robot-1");
     stage.equal(&worker, PATIENCE).await;
     let domain = free_domain().unwrap();
-    let flow = FlowProcess::start(FlowSpec {
-        limit_mbps: 30.0,
-        ..spec(&stage, "robot-1").joined(domain)
-    })
-    .unwrap();
+    let flow =
+        FlowProcess::start(FlowSpec { limit_mbps: 30.0, ..spec(&stage, "robot-1").joined(domain) })
+            .unwrap();
     is_configured(&worker).await;
     let mut acks = Acks::new(&stage);
     stage.put("/layers/edge", layer(&limit(20.0))).await;
     has_limit(&flow, 20.0, PATIENCE);
     acks.next("applied");
 
-    // Directives that no log takes, and a domain that the node file has for something else: each part is good by itself, so the
-    // main service takes it. With it comes a limit, which must not count either.
-    let log = json!({ "flow": { "bandwidth": { "limit_mbps": 7 } }, "log": { "level": "blaze_flow[=info" } });
+    // Directives that no log takes, and a domain that the node file has for something else: each
+    // part is good by itself, so the main service takes it. With it comes a limit, which must not
+    // count either.
+    let log = json!({
+        "flow": { "bandwidth": { "limit_mbps": 7 } },
+        "log": { "level": "blaze_flow[=info" },
+    });
     let dds = json!({ "flow": { "bandwidth": { "limit_mbps": 8 } },
         "brokers": { "layer": { "dds": { "domain": domain, "interface": "127.0.0.1" } } } });
     for (faulty, key) in [(&log, "log.level"), (&dds, "brokers.inter.dds.domain")] {
@@ -187,23 +187,30 @@ async fn what_the_flow_cannot_take_changes_nothing_and_says_so() {
         let ack = acks.next("rejected");
         let detail = ack["detail"].as_str().unwrap();
         assert!(detail.contains(key), "{detail}");
-        check(&flow, "it is shown", |status, detail| {
-            status == "failed" && detail.contains(key)
-        });
+        check(&flow, "it is shown", |status, detail| status == "failed" && detail.contains(key));
         has_limit(&flow, 20.0, Duration::ZERO);
     }
     // It is said again, for whoever was away.
     acks.next("rejected");
 
-    // A roll-out reaches the flow of its canary; one that this refuses is undone by the worker, and has failed.
+    // A roll-out reaches the flow of its canary; one that this refuses is undone by the worker, and
+    // has failed.
     stage.put("/layers/edge", layer(&limit(20.0))).await;
-    let canary =
-        json!([{ "kind": "Node", "name": "robot-1", "labels": { "canary": "true" }, "spec": { "layer": "edge" } }]);
+    let canary = json!([{
+        "kind": "Node",
+        "name": "robot-1",
+        "labels": { "canary": "true" },
+        "spec": { "layer": "edge" },
+    }]);
     stage.send(Method::POST, "/apply", Some(&canary)).await;
     let rollout = |name: &str, flow: &Value| {
         json!({ "name": name, "spec": {
-            "target": { "kind": "Layer", "name": "edge" }, "patch": { "overrides": { "blaze-flow": flow } },
-            "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 600, "max_unhealthy": 0 },
+            "target": { "kind": "Layer", "name": "edge" },
+            "patch": { "overrides": { "blaze-flow": flow } },
+            "canary": { "node_selector": "canary=true" }, "gate": {
+                "window_s": 600,
+                "max_unhealthy": 0,
+            },
         } })
     };
     let slower = rollout("slower", &limit(10.0));
@@ -239,11 +246,8 @@ async fn the_node_file_and_blaze_config_change_apart_from_each_other() {
     stage.robot().await;
     let worker = stage.worker("robot-1");
     stage.equal(&worker, PATIENCE).await;
-    let mut flow = FlowProcess::start(FlowSpec {
-        limit_mbps: 30.0,
-        ..spec(&stage, "robot-1")
-    })
-    .unwrap();
+    let mut flow =
+        FlowProcess::start(FlowSpec { limit_mbps: 30.0, ..spec(&stage, "robot-1") }).unwrap();
     is_configured(&worker).await;
     stage.put("/layers/edge", layer(&limit(20.0))).await;
     has_limit(&flow, 20.0, PATIENCE);
@@ -257,9 +261,7 @@ async fn the_node_file_and_blaze_config_change_apart_from_each_other() {
         seen["share"] == "fair" && seen["limit_mbps"] == 20.0
     });
     // What does not change while a flow runs is named.
-    stage
-        .put("/layers/edge", layer(&json!({ "flow": { "gateway": true } })))
-        .await;
+    stage.put("/layers/edge", layer(&json!({ "flow": { "gateway": true } }))).await;
     has_limit(&flow, 31.0, PATIENCE);
     check(&flow, "it is named", |status, detail| {
         status == "ok" && detail.contains("flow.gateway") && detail.contains("BlazeConfig")
@@ -287,25 +289,32 @@ async fn rates_rules_and_compression_follow_while_messages_flow() {
     stage.equal(&worker, PATIENCE).await;
     let domain = free_domain().unwrap();
     let far_redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
-    let far = FlowSpec::new("fog", "fog-1")
-        .on_redis(&far_redis.url(), "")
-        .joined(domain);
+    let far = FlowSpec::new("fog", "fog-1").on_redis(&far_redis.url(), "").joined(domain);
     let mut flow = FlowProcess::launch(spec(&stage, "robot-1").joined(domain)).unwrap();
     let mut far = FlowProcess::launch(far).unwrap();
     flow.wait_ready().unwrap();
     far.wait_ready().unwrap();
     is_configured(&worker).await;
     let near = stage.redis.url();
-    let advertise = json!({ "op": "advertise", "topic": "camera/x", "service": "camera", "rate_hz": 50, "max_bytes": BYTES, "ttl_s": 600 });
+    let advertise = json!({
+        "op": "advertise",
+        "topic": "camera/x",
+        "service": "camera",
+        "rate_hz": 50,
+        "max_bytes": BYTES,
+        "ttl_s": 600,
+    });
     plain::tell_redis(&near, "", &advertise).unwrap();
-    let request = json!({ "op": "request", "topic": "camera/x", "service": "viewer", "ttl_s": 600 });
+    let request =
+        json!({ "op": "request", "topic": "camera/x", "service": "viewer", "ttl_s": 600 });
     plain::tell_redis(&far_redis.url(), "", &request).unwrap();
     flow.wait_bridge("camera/x", PATIENCE).unwrap();
     let topic = |seen: &Value| {
         let mut rows = seen["topics"].as_array().into_iter().flatten();
         rows.find(|row| row["topic"] == "camera/x").cloned().unwrap_or_default()
     };
-    let rate = move |seen: &Value| topic(seen)["lanes"][0]["allocated_hz"].as_f64().unwrap_or_default();
+    let rate =
+        move |seen: &Value| topic(seen)["lanes"][0]["allocated_hz"].as_f64().unwrap_or_default();
     // 50 Hz of 200 kB need some 80 Mbit/s.
     allocates(&flow, "all of it fits", PATIENCE, move |seen| rate(seen) > 49.0);
     stage.put("/layers/edge", layer(&limit(16.0))).await;
@@ -317,9 +326,7 @@ async fn rates_rules_and_compression_follow_while_messages_flow() {
     let mut ruled = limit(16.0);
     ruled["flow"]["topics"] = json!([{ "match": "camera/**", "max_rate_hz": 4 }]);
     stage.put("/layers/edge", layer(&ruled)).await;
-    allocates(&flow, "the rule counts", soon(), move |seen| {
-        (3.9..4.1).contains(&rate(seen))
-    });
+    allocates(&flow, "the rule counts", soon(), move |seen| (3.9..4.1).contains(&rate(seen)));
     ruled["flow"]["compression"] = json!({ "level": 1, "adaptive": false });
     stage.put("/layers/edge", layer(&ruled)).await;
     let payload = vec![b'a'; BYTES];

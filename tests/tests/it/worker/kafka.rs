@@ -30,7 +30,8 @@ async fn a_plain_client_asks_and_reads_json_with_keys() {
     worker.until("it leads", |status| status["leader"] == true).await;
     let topic = |name: &str| format!("{prefix}{name}");
     let replies = KafkaReader::from_end(&bootstrap, &topic("blaze.reply")).unwrap();
-    let changed = KafkaReader::from_beginning(&bootstrap, &topic("blaze.config.changed.slam")).unwrap();
+    let changed =
+        KafkaReader::from_beginning(&bootstrap, &topic("blaze.config.changed.slam")).unwrap();
     let writer = KafkaWriter::new(&bootstrap).unwrap();
     let ask = |request: &Value| {
         let text = request.to_string();
@@ -38,7 +39,13 @@ async fn a_plain_client_asks_and_reads_json_with_keys() {
     };
     // Without an id nobody could tell whose answer it is.
     ask(&json!({ "service": "slam", "instance": "0", "node": "robot-1" }));
-    ask(&json!({ "id": "7f1c", "service": "slam", "instance": "0", "node": "robot-1", "reply_to": "blaze/reply/me" }));
+    ask(&json!({
+        "id": "7f1c",
+        "service": "slam",
+        "instance": "0",
+        "node": "robot-1",
+        "reply_to": "blaze/reply/me",
+    }));
     let answer = replies.next(PATIENCE).expect("an answer");
     assert_eq!((key(&answer).as_str(), answer.headers.len()), ("7f1c", 0));
     assert_eq!(
@@ -113,7 +120,8 @@ async fn after_the_broker_was_killed_the_last_state_comes_and_nothing_older_afte
     while next(&mut nav).await["deleted"] != true {}
     let asks = json!({ "service": "slam", "instance": "0", "node": "robot-1" });
     assert_eq!(service.ask(asks, PATIENCE).await["config"]["camera"]["rate_hz"], 9);
-    // A worker that lost its lease with the broker takes over from itself, and says once more what holds.
+    // A worker that lost its lease with the broker takes over from itself, and says once more what
+    // holds.
     let again = rest(&mut slam).await;
     assert!(again.len() <= 1 && again.iter().all(|notice| notice["revision"] == last), "{again:?}");
 

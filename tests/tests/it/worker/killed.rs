@@ -1,5 +1,6 @@
-//! Behind a cut link the worker, its broker and its database are killed, all at once. Services have their last configuration two
-//! seconds after the broker is there again, whichever of the copies is left.
+//! Behind a cut link the worker, its broker and its database are killed, all at once. Services have
+//! their last configuration two seconds after the broker is there again, whichever of the copies is
+//! left.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -30,10 +31,9 @@ fn rate(rate_hz: u64) -> Value {
 /// A service that uses the SDK.
 async fn with_sdk(robot: &Robot) -> ServiceManager {
     let broker = Arc::new(RedisBroker::open(&section(&robot.redis), &Role::Service).unwrap());
-    let options = ServiceOptions::new("edge".parse().unwrap(), "slam".parse().unwrap(), broker, Scope::Node);
-    ServiceManager::start(options.on_node(robot.node.parse().unwrap()))
-        .await
-        .unwrap()
+    let options =
+        ServiceOptions::new("edge".parse().unwrap(), "slam".parse().unwrap(), broker, Scope::Node);
+    ServiceManager::start(options.on_node(robot.node.parse().unwrap())).await.unwrap()
 }
 
 /// What services had before the fall, and must have after it.
@@ -44,7 +44,8 @@ struct Last {
 }
 
 impl Last {
-    /// A plain client, a key and a service with the SDK have it, from the copy. `up`: when the broker came back.
+    /// A plain client, a key and a service with the SDK have it, from the copy. `up`: when the
+    /// broker came back.
     async fn is_served(&self, robot: &Robot, up: Instant, what: &str) {
         let mut plain = robot.service().await;
         let served = within(SERVED);
@@ -71,10 +72,7 @@ impl Last {
         assert_eq!(service.config().source(), Some(ConfigSource::Copy), "{what}");
         service.shutdown().await;
         let gone = plain.ask(json!({ "service": "nav" }), PATIENCE).await;
-        assert_eq!(
-            gone["error"]["code"], "not_found",
-            "{what}: what was deleted stays deleted"
-        );
+        assert_eq!(gone["error"]["code"], "not_found", "{what}: what was deleted stays deleted");
         let key = loop {
             match robot.key("blaze:config:slam:0").await {
                 Some(key) => break key,
@@ -88,19 +86,13 @@ impl Last {
 }
 
 async fn all_is_killed_and_comes_back(alone: bool) {
-    let mongo = MongoServer::start(MongoOptions {
-        alone,
-        ..MongoOptions::default()
-    })
-    .unwrap();
+    let mongo = MongoServer::start(MongoOptions { alone, ..MongoOptions::default() }).unwrap();
     let stage = Stage::new();
     let _main = stage.main();
     stage.robot().await;
     let main_at = stage.grpc;
     // It has a runtime of its own, which cannot be started on a thread of this one.
-    let link = tokio::task::spawn_blocking(move || Proxy::start(main_at).unwrap())
-        .await
-        .unwrap();
+    let link = tokio::task::spawn_blocking(move || Proxy::start(main_at).unwrap()).await.unwrap();
     // Something weaker is at hand all the time, and says something else.
     let defaults = stage.path("defaults.yaml");
     let weaker = "kind: Layer\nname: edge\nspec: { kind: edge }\n---\nkind: Service\nname: slam\nspec: { config: { camera: { rate_hz: 1 } } }\n---\nkind: Service\nname: nav\nspec: {}\n";
@@ -115,11 +107,8 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     stage.send(Method::DELETE, "/services/nav", None).await;
     stage.equal(&worker, PATIENCE).await;
     worker.has_kept_all(2).await;
-    let before = robot
-        .service()
-        .await
-        .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
-        .await;
+    let before =
+        robot.service().await.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
     assert_eq!(before["config"]["camera"]["rate_hz"], 7);
     let lived = with_sdk(&robot).await;
     lived.config().ready(PATIENCE).await.unwrap();
@@ -141,10 +130,7 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     // The database stays away, the file is there. The worker waits for the broker.
     let worker = robot.worker_unready(&stage).listening();
     let readiness = worker.text("/readyz").await;
-    assert!(
-        readiness.contains("not_ready") && readiness.contains("node_broker"),
-        "{readiness}"
-    );
+    assert!(readiness.contains("not_ready") && readiness.contains("node_broker"), "{readiness}");
     robot.redis.restart().unwrap();
     last.is_served(&robot, Instant::now(), "the file alone").await;
     // The other way round: the broker waits for the worker, which has to come up within the time.
@@ -190,8 +176,8 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     }
 }
 
-/// The database answers only when the worker already serves its file, which is older: as if it had been killed before that was
-/// written.
+/// The database answers only when the worker already serves its file, which is older: as if it had
+/// been killed before that was written.
 async fn a_late_database_has_something_newer(
     stage: &Stage,
     robot: &Robot,
@@ -215,7 +201,8 @@ async fn a_late_database_has_something_newer(
     let mut service = robot.service().await;
     let mut notices = service.listen("slam").await;
     let asks = json!({ "service": "slam", "instance": "0" });
-    let served = |answer: &Value| (answer["config"]["camera"]["rate_hz"].clone(), answer["source"].clone());
+    let served =
+        |answer: &Value| (answer["config"]["camera"]["rate_hz"].clone(), answer["source"].clone());
     let answer = service.ask(asks.clone(), PATIENCE).await;
     assert_eq!(served(&answer), (json!(8), json!("copy")));
 
@@ -224,10 +211,7 @@ async fn a_late_database_has_something_newer(
     let answer = service.ask(asks.clone(), PATIENCE).await;
     assert_eq!(served(&answer), (json!(9), json!("copy")));
     let status = worker.status().await;
-    assert_eq!(
-        (&status["connected"], status["revision"].as_u64()),
-        (&json!(false), Some(newest))
-    );
+    assert_eq!((&status["connected"], status["revision"].as_u64()), (&json!(false), Some(newest)));
     worker.has_kept_all(2).await;
     assert!(content(&file).contains(NEWER), "the file has it as well");
     // And the database still has it.

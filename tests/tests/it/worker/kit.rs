@@ -90,9 +90,7 @@ impl Starting {
         const SAID: &str = "admin listening on ";
         let said = || {
             let lines = self.0.stderr().into_iter();
-            lines
-                .filter_map(|line| line.split(SAID).nth(1)?.trim().parse().ok())
-                .next()
+            lines.filter_map(|line| line.split(SAID).nth(1)?.trim().parse().ok()).next()
         };
         let admin = wait::until_some("the admin port", PATIENCE, said, || self.0.tail()).unwrap();
         Worker { process: self.0, admin }
@@ -112,9 +110,7 @@ impl ServiceProcess {
     /// What its configuration has been so far, in order.
     pub(crate) fn seen(&self) -> Vec<Value> {
         let lines = self.0.stdout().into_iter();
-        lines
-            .filter_map(|line| serde_json::from_str(line.strip_prefix("config ")?).ok())
-            .collect()
+        lines.filter_map(|line| serde_json::from_str(line.strip_prefix("config ")?).ok()).collect()
     }
 
     /// Waits until its last configuration satisfies.
@@ -122,7 +118,12 @@ impl ServiceProcess {
         self.within(what, PATIENCE, is_good)
     }
 
-    pub(crate) fn within(&self, what: &str, limit: Duration, is_good: impl Fn(&Value) -> bool) -> Value {
+    pub(crate) fn within(
+        &self,
+        what: &str,
+        limit: Duration,
+        is_good: impl Fn(&Value) -> bool,
+    ) -> Value {
         let last = || self.seen().pop().filter(|last| is_good(last));
         wait::until_some(what, limit, last, || self.0.tail()).unwrap()
     }
@@ -135,14 +136,14 @@ impl ServiceProcess {
 impl Worker {
     /// Waits until all copies have what the worker has.
     pub(crate) async fn has_kept_all(&self, copies: usize) {
-        // An answer of the engine: what was asked of it before is done, and its notes are owed or written.
+        // An answer of the engine: what was asked of it before is done, and its notes are owed or
+        // written.
         self.status().await;
         let start = tokio::time::Instant::now();
         loop {
             let metrics = self.text("/metrics").await;
-            let current = metrics
-                .lines()
-                .filter(|line| line.starts_with("blaze_worker_copy_current{"));
+            let current =
+                metrics.lines().filter(|line| line.starts_with("blaze_worker_copy_current{"));
             if current.filter(|line| line.ends_with(" 1")).count() == copies {
                 return;
             }
@@ -157,7 +158,10 @@ impl Worker {
 }
 
 /// The next notice that satisfies; those before it are passed over.
-pub(crate) async fn next_that(notices: &mut Subscription, is_good: impl Fn(&Value) -> bool) -> Value {
+pub(crate) async fn next_that(
+    notices: &mut Subscription,
+    is_good: impl Fn(&Value) -> bool,
+) -> Value {
     loop {
         let notice = next(notices).await;
         if is_good(&notice) {

@@ -1,4 +1,5 @@
-//! One worker for a whole layer, on Kafka and on DDS: what services ask, are told and say, and what who comes late finds.
+//! One worker for a whole layer, on Kafka and on DDS: what services ask, are told and say, and what
+//! who comes late finds.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -97,7 +98,11 @@ async fn everything(stage: &Stage) -> (Process, Worker, BTreeMap<String, Value>)
 }
 
 /// What the main service has last told of `slam`: of the instance, and of the service without.
-async fn until_told(mut slam: Subscription, last: &BTreeMap<String, Value>, stage: &Stage) -> BTreeMap<String, Value> {
+async fn until_told(
+    mut slam: Subscription,
+    last: &BTreeMap<String, Value>,
+    stage: &Stage,
+) -> BTreeMap<String, Value> {
     let mut found: BTreeMap<String, Value> = BTreeMap::new();
     let effective = stage.get("/effective?service=slam&instance=0").await;
     loop {
@@ -120,10 +125,7 @@ async fn answers(stage: &Stage) {
     let asks = json!({ "service": "slam", "instance": "0", "node": "robot-1" });
     let answer = service.ask(asks.clone(), PATIENCE).await;
     let effective = stage.get("/effective?service=slam&instance=0").await;
-    assert_eq!(
-        (&answer["config"], &answer["hash"]),
-        (&effective["config"], &effective["hash"])
-    );
+    assert_eq!((&answer["config"], &answer["hash"]), (&effective["config"], &effective["hash"]));
     assert_eq!(
         (&answer["source"], &answer["layer"], &answer["node"]),
         (&json!("main"), &json!("edge"), &json!("robot-1"))
@@ -168,9 +170,7 @@ async fn notices(stage: &Stage, worker: &Worker, first: u64) -> BTreeMap<String,
         "it concerns nobody else: {of_nav:?}"
     );
     // Who is there from the first moment on hears of the first change.
-    stage
-        .apply(&[("Service", "late", json!({ "config": { "x": 1 } }))])
-        .await;
+    stage.apply(&[("Service", "late", json!({ "config": { "x": 1 } }))]).await;
     stage.equal(worker, PATIENCE).await;
     let mut late = service.listen("late").await;
     let revision = stage.put("/services/late", json!({ "config": { "x": 2 } })).await;
@@ -178,10 +178,7 @@ async fn notices(stage: &Stage, worker: &Worker, first: u64) -> BTreeMap<String,
     while notice["config"]["x"] != 2 {
         notice = next(&mut late).await;
     }
-    assert_eq!(
-        (&notice["instance"], &notice["revision"]),
-        (&json!(null), &json!(revision))
-    );
+    assert_eq!((&notice["instance"], &notice["revision"]), (&json!(null), &json!(revision)));
     last
 }
 
@@ -193,9 +190,7 @@ async fn by_the_sdk(stage: &Stage, worker: &Worker) {
         stage.broker().await,
         Scope::Layer,
     );
-    let service = ServiceManager::start(options.on_node("robot-1".parse().unwrap()))
-        .await
-        .unwrap();
+    let service = ServiceManager::start(options.on_node("robot-1".parse().unwrap())).await.unwrap();
     let (told, mut changes) = mpsc::channel(64);
     let config = service.config();
     let _listener = config.on_change(move |change| {

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use blaze_brokers::redis::RedisKeys;
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_tests::servers::{
-    KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer, drop_mongo_database,
-    shared_mongo, unique_name,
+    KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer,
+    drop_mongo_database, shared_mongo, unique_name,
 };
 use blaze_worker::lease::conformance::{BUSY, TIME, run_all};
 use blaze_worker::lease::{KafkaLease, Lease, MongoLease, RedisLease};
@@ -20,7 +20,8 @@ const FIRST_ON_KAFKA: Duration = Duration::from_secs(10);
 
 async fn run_on_redis(kind: RedisKind) {
     let server = RedisServer::start(kind, RedisOptions::default()).unwrap();
-    let file = json!({ "brokers": { "node": { "redis": { "url": server.url(), "prefix": "x:" } } } });
+    let file =
+        json!({ "brokers": { "node": { "redis": { "url": server.url(), "prefix": "x:" } } } });
     let Some(NodeBroker::Redis(section)) = NodeFile::read(&file).unwrap().0.brokers.node else {
         panic!("no Redis in {file}");
     };
@@ -40,7 +41,8 @@ async fn run_on_mongo(uri: &str, database: &str) -> Result<(), String> {
 }
 
 fn on_kafka(server: &KafkaServer, layer: &str) -> Arc<dyn Lease> {
-    let file = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()], "prefix": "x." } } } });
+    let file = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()],
+        "prefix": "x." } } } });
     let Some(LayerBroker::Kafka(section)) = NodeFile::read(&file).unwrap().0.brokers.layer else {
         panic!("no Kafka in {file}");
     };
@@ -65,10 +67,7 @@ async fn one_on_a_replica_set_of_mongodb_passes_the_suite() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_on_a_mongodb_that_is_alone_passes_the_suite() {
-    let options = MongoOptions {
-        alone: true,
-        ..MongoOptions::default()
-    };
+    let options = MongoOptions { alone: true, ..MongoOptions::default() };
     let server = MongoServer::start(options).unwrap();
     run_on_mongo(&server.uri(), "blaze").await.unwrap();
 }
@@ -84,7 +83,8 @@ async fn one_in_a_group_of_kafka_passes_the_suite() {
 async fn one_in_a_group_of_kafka_has_one_owner_though_the_topic_has_two_partitions() {
     let server = KafkaServer::start(KafkaOptions::default()).unwrap();
     let mut config = ClientConfig::new();
-    let admin: AdminClient<_> = config.set("bootstrap.servers", server.bootstrap()).create().unwrap();
+    let admin: AdminClient<_> =
+        config.set("bootstrap.servers", server.bootstrap()).create().unwrap();
     let topic = NewTopic::new("x.blaze.worker.lease", 2, TopicReplication::Fixed(1));
     let made = admin.create_topics([&topic], &AdminOptions::new()).await;
     assert!(made.unwrap().iter().all(Result::is_ok), "the topic is not made");
@@ -125,10 +125,9 @@ async fn one_in_a_group_of_kafka_outlives_the_broker_and_the_topic() {
     until(&late, "who begins does not get what is over").await;
     println!("who begins has it after {:?}", start.elapsed());
     let mut config = ClientConfig::new();
-    let admin: AdminClient<_> = config.set("bootstrap.servers", server.bootstrap()).create().unwrap();
-    let deleted = admin
-        .delete_topics(&["x.blaze.worker.lease"], &AdminOptions::new())
-        .await;
+    let admin: AdminClient<_> =
+        config.set("bootstrap.servers", server.bootstrap()).create().unwrap();
+    let deleted = admin.delete_topics(&["x.blaze.worker.lease"], &AdminOptions::new()).await;
     assert!(deleted.unwrap().iter().all(Result::is_ok), "the topic is not deleted");
     until(&one, "nobody has it after the topic was deleted").await;
     assert!(!late.hold(TIME, None).await.unwrap_or_default().is_held, "two have it");

@@ -1,4 +1,5 @@
-//! The worker as services and operators have it: real `blaze-config`, `blaze-worker` and Redis, killed and started again.
+//! The worker as services and operators have it: real `blaze-config`, `blaze-worker` and Redis,
+//! killed and started again.
 //!
 //! Needs `cargo build --workspace` and `scripts/services install`.
 //!

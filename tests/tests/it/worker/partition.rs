@@ -1,5 +1,6 @@
-//! The link to the main service loses everything without a word while very much is changed. Afterwards all is as if nothing had
-//! been: equal within five seconds, each service told once of what has become of its configuration, and nothing resurrected.
+//! The link to the main service loses everything without a word while very much is changed.
+//! Afterwards all is as if nothing had been: equal within five seconds, each service told once of
+//! what has become of its configuration, and nothing resurrected.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -38,7 +39,9 @@ impl Cut<'_> {
     fn begin(&self) {
         let Self { namespace, port } = self;
         let rules = format!("tcp dport {port} drop; tcp sport {port} drop;");
-        let table = format!("table ip cut {{ chain lost {{ type filter hook input priority 0; {rules} }}; }}");
+        let table = format!(
+            "table ip cut {{ chain lost {{ type filter hook input priority 0; {rules} }}; }}"
+        );
         run(&format!("ip netns exec {namespace} nft '{table}'")).unwrap();
     }
 
@@ -88,13 +91,11 @@ impl<'a> Changes<'a> {
     /// A service with an instance on each robot.
     async fn create(&mut self, service: &'static str, n: u64) {
         self.count += 1;
-        let instances = ROBOTS.map(|robot| (format!("{service}/{robot}"), json!({ "node": robot })));
+        let instances =
+            ROBOTS.map(|robot| (format!("{service}/{robot}"), json!({ "node": robot })));
         let mut documents = vec![("Service", service, json!({ "config": { "n": n } }))];
-        documents.extend(
-            instances
-                .iter()
-                .map(|(name, spec)| ("Instance", name.as_str(), spec.clone())),
-        );
+        documents
+            .extend(instances.iter().map(|(name, spec)| ("Instance", name.as_str(), spec.clone())));
         self.stage.apply(&documents).await;
         self.is_there.insert(service, true);
     }
@@ -119,8 +120,7 @@ impl<'a> Changes<'a> {
                 self.put("/layers/edge", spec).await;
             }
             (_, true) => {
-                self.put(&format!("/services/{service}"), json!({ "config": { "n": n } }))
-                    .await;
+                self.put(&format!("/services/{service}"), json!({ "config": { "n": n } })).await;
             }
         }
     }
@@ -139,9 +139,7 @@ impl<'a> Changes<'a> {
 
 /// What somebody who asks has: the hash; `None`: there is no such service.
 async fn ask(service: &mut Service, place: &Place) -> (Option<String>, u64) {
-    let answer = service
-        .ask(json!({ "service": place.0, "instance": place.1 }), PATIENCE)
-        .await;
+    let answer = service.ask(json!({ "service": place.0, "instance": place.1 }), PATIENCE).await;
     match answer["hash"].as_str() {
         Some(hash) => (Some(hash.to_owned()), answer["revision"].as_u64().unwrap()),
         None => {
@@ -173,23 +171,19 @@ impl Watched {
         for name in services() {
             heard.insert(name, service.listen(name).await);
         }
-        Self {
-            robot,
-            worker,
-            service,
-            heard,
-            before: BTreeMap::new(),
-        }
+        Self { robot, worker, service, heard, before: BTreeMap::new() }
     }
 
-    /// All notices up to those that a change of everything, at this revision, brings to every place.
+    /// All notices up to those that a change of everything, at this revision, brings to every
+    /// place.
     async fn until(&mut self, revision: u64) -> BTreeMap<Place, Vec<Value>> {
         let mut all: BTreeMap<Place, Vec<Value>> = BTreeMap::new();
         for (name, notices) in &mut self.heard {
             let (mut newest, mut missing) = (0, 2);
             while missing > 0 {
                 let notice = next(notices).await;
-                let (at, instance) = (notice["revision"].as_u64().unwrap(), notice["instance"].as_str());
+                let (at, instance) =
+                    (notice["revision"].as_u64().unwrap(), notice["instance"].as_str());
                 assert!(at >= newest, "{name}: {notice} after revision {newest}");
                 newest = at;
                 missing -= usize::from(at >= revision);
@@ -210,7 +204,8 @@ impl Watched {
         }
     }
 
-    /// Each place has what the main service has for it, by whatever way it looks; what is gone is nowhere.
+    /// Each place has what the main service has for it, by whatever way it looks; what is gone is
+    /// nowhere.
     async fn check_state(&mut self, stage: &Stage, is_there: &BTreeMap<&'static str, bool>) {
         for place in self.before.keys().copied().collect::<Vec<_>>() {
             let (name, instance) = place;
@@ -221,9 +216,8 @@ impl Watched {
                 assert_eq!((&hash, &key), (&None, &None), "{place:?} is back");
                 continue;
             }
-            let instance = instance
-                .map(|instance| format!("&instance={instance}"))
-                .unwrap_or_default();
+            let instance =
+                instance.map(|instance| format!("&instance={instance}")).unwrap_or_default();
             let effective = stage
                 .get(&format!("/effective?service={name}&node={}{instance}", self.robot.node))
                 .await;
@@ -232,12 +226,13 @@ impl Watched {
         }
     }
 
-    /// Compares what was told of the outage with what each place had before and has now. `marker`: a change of everything
-    /// after it.
+    /// Compares what was told of the outage with what each place had before and has now. `marker`:
+    /// a change of everything after it.
     fn check_told(&self, told: &BTreeMap<Place, Vec<Value>>, marker: u64) {
         let is_marker = |notice: &&Value| notice["revision"].as_u64().unwrap() >= marker;
         for (place, (before, revision)) in &self.before {
-            let of_outage: Vec<&Value> = told[place].iter().filter(|notice| !is_marker(notice)).collect();
+            let of_outage: Vec<&Value> =
+                told[place].iter().filter(|notice| !is_marker(notice)).collect();
             let after = told[place].iter().find(is_marker).unwrap()["previous_hash"]
                 .as_str()
                 .map(str::to_owned);
@@ -269,18 +264,20 @@ async fn documents(stage: &Stage) {
     }
 }
 
-/// One commit after which every place has another configuration than before; those that are gone are there again.
+/// One commit after which every place has another configuration than before; those that are gone
+/// are there again.
 async fn change_all(stage: &Stage, mark: &str, gone: &[&'static str]) -> u64 {
     let layer = json!({ "kind": "edge", "config": { "mark": mark } });
     let mut documents = vec![("Layer", "edge".to_owned(), layer)];
     for service in gone {
         documents.push(("Service", (*service).to_owned(), json!({ "config": {} })));
-        documents.extend(ROBOTS.map(|robot| ("Instance", format!("{service}/{robot}"), json!({ "node": robot }))));
+        documents.extend(
+            ROBOTS
+                .map(|robot| ("Instance", format!("{service}/{robot}"), json!({ "node": robot }))),
+        );
     }
-    let documents: Vec<_> = documents
-        .iter()
-        .map(|(kind, name, spec)| (*kind, name.as_str(), spec.clone()))
-        .collect();
+    let documents: Vec<_> =
+        documents.iter().map(|(kind, name, spec)| (*kind, name.as_str(), spec.clone())).collect();
     stage.apply(&documents).await
 }
 
@@ -302,10 +299,7 @@ async fn everything_changes_behind_a_cut(namespace: &str) {
     }
     let uid = stage.get("/services/again").await["uid"].clone();
 
-    let cut = Cut {
-        namespace,
-        port: stage.grpc.port(),
-    };
+    let cut = Cut { namespace, port: stage.grpc.port() };
     cut.begin();
     let (began, wanted) = (tokio::time::Instant::now(), if long() { 500 } else { 60 });
     let mut changes = Changes::new(&stage);
@@ -317,13 +311,14 @@ async fn everything_changes_behind_a_cut(namespace: &str) {
         changes.one().await;
     }
     // What all services of the layer get is at last what it was.
-    let layer = json!({ "kind": "edge", "config": { "mark": "before" }, "overrides": { "map": { "all": wanted } } });
+    let layer = json!({
+        "kind": "edge",
+        "config": { "mark": "before" },
+        "overrides": { "map": { "all": wanted } },
+    });
     changes.put("/layers/edge", layer).await;
     for robot in &mut robots {
-        robot
-            .worker
-            .until("the cut is noticed", |status| status["connected"] == false)
-            .await;
+        robot.worker.until("the cut is noticed", |status| status["connected"] == false).await;
     }
     if long() {
         tokio::time::sleep_until(began + Duration::from_secs(30)).await;
@@ -358,13 +353,13 @@ async fn everything_changes_behind_a_cut(namespace: &str) {
 #[test]
 fn a_cut_link_with_changes_of_everything_leaves_no_trace() {
     // Two hosts, of which one is used: nothing outside of it sees the cut.
-    let network = Topology::build(&Plan::new().with_hosts(&["site", "other"]).with_lan(&["site", "other"])).unwrap();
+    let network =
+        Topology::build(&Plan::new().with_hosts(&["site", "other"]).with_lan(&["site", "other"]))
+            .unwrap();
     let namespace = network.host("site").unwrap().namespace.clone();
     inside(&namespace, || {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(2)
-            .enable_all()
-            .build()?;
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
         runtime.block_on(everything_changes_behind_a_cut(&namespace));
         Ok(())
     })

@@ -1,5 +1,5 @@
-//! `Sync` as bytes: a main service that says whatever a test lets it, and a worker likewise. So what was recorded is sent as it
-//! was, and what no version of ours says can be said.
+//! `Sync` as bytes: a main service that says whatever a test lets it, and a worker likewise. So
+//! what was recorded is sent as it was, and what no version of ours says can be said.
 //!
 //! ```text
 //! real worker ─▶ RawMain ─Session─▶ test ─RawStream─▶ real main service
@@ -88,7 +88,9 @@ impl StreamingService<Bytes> for Method {
             let session = Session { said, tell };
             let gone = |_| Status::unavailable("the test is over");
             sessions.send(session).await.map_err(gone)?;
-            let told = futures::stream::unfold(told, |mut told| async move { Some((told.recv().await?, told)) });
+            let told = futures::stream::unfold(told, |mut told| async move {
+                Some((told.recv().await?, told))
+            });
             Ok(Response::new(told.boxed()))
         })
     }
@@ -134,11 +136,7 @@ impl RawMain {
             let router = tonic::transport::Server::builder().add_service(Method(send));
             router.serve_with_incoming(TcpIncoming::from(listener)).await.unwrap();
         });
-        Self {
-            address,
-            sessions,
-            _server: server,
-        }
+        Self { address, sessions, _server: server }
     }
 
     /// The next stream that a worker opens.
@@ -161,13 +159,13 @@ impl RawStream {
         client.ready().await.unwrap();
         let (say, said) = mpsc::channel(QUEUE);
         say.send(first).await.unwrap();
-        let said = futures::stream::unfold(said, |mut said| async move { Some((said.recv().await?, said)) });
-        let told = client
-            .streaming(Request::new(said), PathAndQuery::from_static(PATH), AsIs)
-            .await?;
-        Ok(Self {
-            say,
-            told: told.into_inner(),
-        })
+        let said =
+            futures::stream::unfold(
+                said,
+                |mut said| async move { Some((said.recv().await?, said)) },
+            );
+        let told =
+            client.streaming(Request::new(said), PathAndQuery::from_static(PATH), AsIs).await?;
+        Ok(Self { say, told: told.into_inner() })
     }
 }

@@ -65,7 +65,12 @@ pub(crate) fn read(path: &Path) -> Vec<Recorded> {
 pub(crate) fn write(path: &Path, recorded: &[Recorded]) {
     let lines = recorded.iter().map(|one| {
         let by = if one.by_worker { "worker" } else { "main" };
-        let line = json!({ "stream": one.stream, "by": by, "kind": one.kind(), "bytes": STANDARD.encode(&one.bytes) });
+        let line = json!({
+            "stream": one.stream,
+            "by": by,
+            "kind": one.kind(),
+            "bytes": STANDARD.encode(&one.bytes),
+        });
         format!("{line}\n")
     });
     std::fs::write(path, lines.collect::<String>()).unwrap();
@@ -91,11 +96,11 @@ pub(crate) fn count(recorded: &[Recorded], kind: &str) -> usize {
 
 /// The last revision and digest that a recording tells.
 pub(crate) fn last_digest(recorded: &[Recorded]) -> (u64, String) {
-    let digests = recorded
-        .iter()
-        .filter(|one| !one.by_worker)
-        .filter_map(|one| match told(&one.bytes) {
-            Told::Bookmark(bookmark) if !bookmark.digest.is_empty() => Some((bookmark.revision, bookmark.digest)),
+    let digests =
+        recorded.iter().filter(|one| !one.by_worker).filter_map(|one| match told(&one.bytes) {
+            Told::Bookmark(bookmark) if !bookmark.digest.is_empty() => {
+                Some((bookmark.revision, bookmark.digest))
+            }
             _ => None,
         });
     digests.last().unwrap()

@@ -1,4 +1,5 @@
-//! Roll-outs with services that judge them: a bad value stops at the canary, and stays away whoever is killed meanwhile.
+//! Roll-outs with services that judge them: a bad value stops at the canary, and stays away whoever
+//! is killed meanwhile.
 
 use std::collections::BTreeSet;
 use std::process::Command;
@@ -16,8 +17,14 @@ const FORMER: u64 = 10;
 
 fn rollout(name: &str, rate_hz: u64) -> Value {
     json!({ "kind": "Rollout", "name": name, "spec": {
-        "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "rate_hz": rate_hz } },
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 600, "max_unhealthy": 0 },
+        "target": {
+            "kind": "Service",
+            "name": "slam",
+        }, "patch": { "config": { "rate_hz": rate_hz } },
+        "canary": { "node_selector": "canary=true" }, "gate": {
+            "window_s": 600,
+            "max_unhealthy": 0,
+        },
     } })
 }
 
@@ -25,7 +32,12 @@ fn rollout(name: &str, rate_hz: u64) -> Value {
 async fn documents(stage: &Stage) {
     let documents = json!([
         { "kind": "Layer", "name": "edge", "spec": { "kind": "edge" } },
-        { "kind": "Node", "name": "robot-1", "labels": { "canary": "true" }, "spec": { "layer": "edge" } },
+        {
+            "kind": "Node",
+            "name": "robot-1",
+            "labels": { "canary": "true" },
+            "spec": { "layer": "edge" },
+        },
         { "kind": "Node", "name": "robot-2", "spec": { "layer": "edge" } },
         { "kind": "Service", "name": "slam", "spec": { "config": { "rate_hz": FORMER } } },
         { "kind": "Instance", "service": "slam", "name": "a", "spec": { "node": "robot-1" } },
@@ -60,7 +72,8 @@ fn rates(service: &ServiceProcess) -> BTreeSet<u64> {
     service.seen().iter().filter_map(rate).collect()
 }
 
-/// Waits until the roll-out has ended in this way on the main service, and gives what it says of its first canary.
+/// Waits until the roll-out has ended in this way on the main service, and gives what it says of
+/// its first canary.
 async fn ends(stage: &Stage, name: &str, phase: &str) -> Value {
     let start = tokio::time::Instant::now();
     loop {
@@ -106,17 +119,12 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
 
     // The main service is gone before the service says what it thinks.
     main.kill().unwrap();
-    canary
-        .until("nobody is there", |status| status["connected"] == false)
-        .await;
+    canary.until("nobody is there", |status| status["connected"] == false).await;
     assert_eq!(a.seen().last().and_then(rate), Some(99));
     std::fs::write(&judges, "").unwrap();
     a.until("it is undone", has(FORMER));
     let failed = is_failed(&canary).await;
-    assert!(
-        failed["reason"].as_str().unwrap().contains("rate_hz: at most 30"),
-        "{failed}"
-    );
+    assert!(failed["reason"].as_str().unwrap().contains("rate_hz: at most 30"), "{failed}");
 
     // Neither does it come back in a new life of the canary's worker and broker.
     canary.has_kept_all(1).await;
@@ -130,10 +138,7 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     let asks = json!({ "service": "slam", "instance": "a" });
     assert_eq!(plain.ask(asks.clone(), PATIENCE).await["config"]["rate_hz"], FORMER);
     let key = first.key("blaze:config:slam:a").await.unwrap();
-    assert_eq!(
-        (&key["config"]["rate_hz"], &key["rollout"]),
-        (&json!(FORMER), &Value::Null)
-    );
+    assert_eq!((&key["config"]["rate_hz"], &key["rollout"]), (&json!(FORMER), &Value::Null));
     let late = first.run("slam", "late", &judge);
     late.until("a new one has the former value", has(FORMER));
 
@@ -145,7 +150,8 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     assert_eq!(status["status"]["phase"], "failed");
     stage.equal(&canary, PATIENCE).await;
     stage.equal(&other, PATIENCE).await;
-    // Both have noted it for a life after this one. Who asked is kept as well: else `late` hears nothing until it asks again.
+    // Both have noted it for a life after this one. Who asked is kept as well: else `late` hears
+    // nothing until it asks again.
     canary.has_kept_all(1).await;
     main.kill().unwrap();
     canary.kill();
@@ -157,9 +163,7 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     assert_eq!(plain.ask(asks, PATIENCE).await["config"]["rate_hz"], FORMER);
 
     // A change that everybody hears of: what had been told before has come by then.
-    stage
-        .put("/layers/edge", json!({ "kind": "edge", "config": { "mark": 1 } }))
-        .await;
+    stage.put("/layers/edge", json!({ "kind": "edge", "config": { "mark": 1 } })).await;
     for service in [&a, &b, &late] {
         service.until("the mark", |config| config["config"]["mark"] == 1);
     }
@@ -168,10 +172,7 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     let after = &a.seen()[count..];
     assert!(after.iter().all(has(FORMER)), "it came back: {after:?}");
     let notices = rest(&mut heard).await;
-    assert!(
-        notices.iter().all(|notice| notice["config"]["mark"] == 1),
-        "{notices:?}"
-    );
+    assert!(notices.iter().all(|notice| notice["config"]["mark"] == 1), "{notices:?}");
     for process in [a, b, late] {
         process.kill();
     }
@@ -209,9 +210,7 @@ async fn a_good_one_is_promoted_and_others_are_undone() {
     assert_eq!(a.seen().last().and_then(rate), Some(20));
 
     // Aborted by the command line.
-    stage
-        .send(Method::POST, "/rollouts", Some(&rollout("aborted", 25)))
-        .await;
+    stage.send(Method::POST, "/rollouts", Some(&rollout("aborted", 25))).await;
     a.until("the canary tries it", has(25));
     let said = blaze(stage, &["rollout", "abort", "aborted", "--reason", "no need"]).unwrap();
     assert_eq!(said["status"]["phase"], "aborted", "{said}");
@@ -226,37 +225,24 @@ async fn a_good_one_is_promoted_and_others_are_undone() {
     a.until("undone", has(20));
     let is_well = |status: &Value| {
         let services = status["services"].as_array().unwrap();
-        services
-            .iter()
-            .any(|service| service["instance"] == "a" && service["state"] == "ready")
+        services.iter().any(|service| service["instance"] == "a" && service["state"] == "ready")
     };
     canary.until("it is well again", is_well).await;
 
     // One that kills the service, which its watchdog does not say any more.
-    stage
-        .send(Method::POST, "/rollouts", Some(&rollout("deadly", 40)))
-        .await;
+    stage.send(Method::POST, "/rollouts", Some(&rollout("deadly", 40))).await;
     a.until("the canary tries it", has(40));
     let is_applied = |status: &Value| {
         let rollouts = status["rollouts"].as_array().unwrap();
-        rollouts
-            .iter()
-            .any(|rollout| rollout["name"] == "deadly" && rollout["phase"] == "applied")
+        rollouts.iter().any(|rollout| rollout["name"] == "deadly" && rollout["phase"] == "applied")
     };
     canary.until("it is judged", is_applied).await;
     a.kill();
     let failed = ends(stage, "deadly", "failed").await;
-    assert!(
-        failed["reason"].as_str().unwrap().contains("lost its watchdog"),
-        "{failed}"
-    );
+    assert!(failed["reason"].as_str().unwrap().contains("lost its watchdog"), "{failed}");
     let a = first.run("slam", "a", &judge);
     a.until("the next life has the former value", has(20));
-    assert_eq!(
-        rates(&b),
-        BTreeSet::from([FORMER, 20]),
-        "the other robot had what was promoted"
-    );
+    assert_eq!(rates(&b), BTreeSet::from([FORMER, 20]), "the other robot had what was promoted");
     stage.equal(&canary, PATIENCE).await;
     stage.equal(&other, PATIENCE).await;
 }

@@ -1,5 +1,6 @@
-//! A secret that services are not told is nowhere: not with the broker, not in logs, metrics or answers, not in the copies, and not in
-//! the memory of the worker. Where services are told it, the copies have it encrypted or not at all.
+//! A secret that services are not told is nowhere: not with the broker, not in logs, metrics or
+//! answers, not in the copies, and not in the memory of the worker. Where services are told it, the
+//! copies have it encrypted or not at all.
 
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::TcpStream;
@@ -31,10 +32,16 @@ fn secret(number: u32) -> Value {
 }
 
 fn config(number: u32) -> Value {
-    json!({ "plain": PLAIN, "number": number, "db": { "password": secret(number) }, "list": [{ "key": secret(number + 1) }] })
+    json!({
+        "plain": PLAIN,
+        "number": number,
+        "db": { "password": secret(number) },
+        "list": [{ "key": secret(number + 1) }],
+    })
 }
 
-/// Fails where a secret is found, also as a plain encoding of it. Gives whether what stands beside the secrets is there.
+/// Fails where a secret is found, also as a plain encoding of it. Gives whether what stands beside
+/// the secrets is there.
 fn clean(what: &str, text: &str) -> bool {
     let encoded = (0..3).map(|skip| {
         let bytes = &CANARY.as_bytes()[skip..];
@@ -43,10 +50,7 @@ fn clean(what: &str, text: &str) -> bool {
     for canary in encoded.chain([CANARY.to_owned()]) {
         if let Some(at) = text.find(&canary) {
             let from = text.floor_char_boundary(at.saturating_sub(300));
-            panic!(
-                "{what} holds the secret: {}",
-                &text[from..text.ceil_char_boundary(at + 100)]
-            );
+            panic!("{what} holds the secret: {}", &text[from..text.ceil_char_boundary(at + 100)]);
         }
     }
     text.contains(PLAIN)
@@ -80,8 +84,10 @@ impl Monitor {
 
 /// All keys of a Redis with what they hold.
 fn keys(redis: &RedisServer) -> String {
-    let script = "local out = {} for _, key in ipairs(redis.call('KEYS', '*')) do out[#out + 1] = key \
-                  if redis.call('TYPE', key).ok == 'string' then out[#out + 1] = redis.call('GET', key) \
+    let script = "local out = {} for _, key in ipairs(redis.call('KEYS', '*')) do out[#out + 1] = \
+                  key \
+                  if redis.call('TYPE', key).ok == 'string' then out[#out + 1] = redis.call('GET', \
+                  key) \
                   else out[#out + 1] = cjson.encode(redis.call('HGETALL', key)) end end return out";
     redis.cli(&["EVAL", script, "0"]).unwrap()
 }
@@ -89,16 +95,34 @@ fn keys(redis: &RedisServer) -> String {
 /// Secrets in documents of each kind that can have them.
 async fn documents(stage: &Stage) {
     let documents = json!([
-        { "kind": "Layer", "name": "edge", "spec": { "kind": "edge", "config": { "of_layer": config(10) }, "overrides": { "slam": { "more": config(12) } } } },
-        { "kind": "Node", "name": "robot-1", "spec": { "layer": "edge", "config": { "of_node": config(14) } } },
+        {
+            "kind": "Layer",
+            "name": "edge",
+            "spec": {
+                "kind": "edge",
+                "config": { "of_layer": config(10) },
+                "overrides": { "slam": { "more": config(12) } },
+            },
+        },
+        {
+            "kind": "Node",
+            "name": "robot-1",
+            "spec": { "layer": "edge", "config": { "of_node": config(14) } },
+        },
         { "kind": "Service", "name": "slam", "spec": { "config": config(16) } },
         { "kind": "Service", "name": "nav", "spec": { "config": config(18) } },
-        { "kind": "Instance", "service": "slam", "name": "0", "spec": { "node": "robot-1", "config": { "own": config(20) } } },
+        {
+            "kind": "Instance",
+            "service": "slam",
+            "name": "0",
+            "spec": { "node": "robot-1", "config": { "own": config(20) } },
+        },
     ]);
     stage.send(Method::POST, "/apply", Some(&documents)).await;
 }
 
-/// Services ask and hear while the secrets are changed in each way. `is_shown`: whether they are to get the texts.
+/// Services ask and hear while the secrets are changed in each way. `is_shown`: whether they are to
+/// get the texts.
 async fn everything(stage: &Stage, robot: &Robot, worker: &Worker, is_shown: bool) {
     let mut plain = robot.service().await;
     let mut notices = plain.listen("slam").await;
@@ -108,11 +132,9 @@ async fn everything(stage: &Stage, robot: &Robot, worker: &Worker, is_shown: boo
         assert_eq!(text.contains(CANARY), is_shown, "{what}: {text}");
         assert!(text.contains(PLAIN), "{what}: {text}");
     };
-    for request in [
-        json!({ "service": "slam", "instance": "0" }),
-        json!({ "service": "nav" }),
-        json!({}),
-    ] {
+    for request in
+        [json!({ "service": "slam", "instance": "0" }), json!({ "service": "nav" }), json!({})]
+    {
         is_right("the answer", &plain.ask(request, PATIENCE).await.to_string());
     }
     let spec = json!({ "config": config(30) });
@@ -125,9 +147,7 @@ async fn everything(stage: &Stage, robot: &Robot, worker: &Worker, is_shown: boo
         spec["config"]["number"] = json!(number);
         stage.put("/services/slam", spec).await;
     }
-    stage
-        .put("/services/nav", json!({ "config": { "plain": PLAIN } }))
-        .await;
+    stage.put("/services/nav", json!({ "config": { "plain": PLAIN } })).await;
     stage.put("/services/nav", json!({ "config": config(40) })).await;
     stage.send(Method::DELETE, "/services/nav", None).await;
     stage.equal(worker, PATIENCE).await;
@@ -158,11 +178,8 @@ async fn operator_sees_none(worker: &Worker, logs: &[&Path]) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_services_are_not_told_is_nowhere() {
     let stage = Stage::new();
-    let (main_log, log, log_again) = (
-        stage.path("main.log"),
-        stage.path("worker.log"),
-        stage.path("again.log"),
-    );
+    let (main_log, log, log_again) =
+        (stage.path("main.log"), stage.path("worker.log"), stage.path("again.log"));
     let main = stage.main_at("trace", Some(&main_log));
     documents(&stage).await;
     let robot = Robot::new(&stage, "robot-1").with(&json!({
@@ -178,13 +195,10 @@ async fn what_services_are_not_told_is_nowhere() {
     assert!(clean("Redis", &keys(&robot.redis)));
     assert!(clean("what Redis was told", &monitor.seen()));
     assert!(clean("the file", &content(&stage.path("robot-1"))));
-    let in_memory = |worker: &Worker, text: &str| worker.process.count_in_memory(text.as_bytes()).unwrap();
+    let in_memory =
+        |worker: &Worker, text: &str| worker.process.count_in_memory(text.as_bytes()).unwrap();
     assert!(in_memory(&worker, PLAIN) > 0);
-    assert_eq!(
-        in_memory(&worker, CANARY),
-        0,
-        "the worker has the text of a secret in its memory"
-    );
+    assert_eq!(in_memory(&worker, CANARY), 0, "the worker has the text of a secret in its memory");
     println!(
         "the main service has it {} times in its memory",
         main.count_in_memory(CANARY.as_bytes()).unwrap()
@@ -195,9 +209,7 @@ async fn what_services_are_not_told_is_nowhere() {
     worker.kill();
     let worker = robot.worker_logged(&stage, &log_again);
     let mut service = robot.service().await;
-    let answer = service
-        .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
-        .await;
+    let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
     assert_eq!(answer["source"], "copy");
     assert!(clean("the answer", &answer.to_string()));
     let _main = stage.main_at("trace", Some(&main_log));
@@ -213,10 +225,7 @@ async fn what_services_are_not_told_is_nowhere() {
 fn leaves_no_core(mut worker: Worker) {
     let allow = |id: u32| {
         let pid = Pid::from_raw(i32::try_from(id).unwrap());
-        let endless = Rlimit {
-            current: None,
-            maximum: None,
-        };
+        let endless = Rlimit { current: None, maximum: None };
         prlimit(pid, Resource::Core, endless).unwrap();
     };
     let folder = tempfile::tempdir().unwrap();
@@ -238,7 +247,8 @@ fn leaves_no_core(mut worker: Worker) {
     println!("another process leaves a core dump here: {is_dumped}");
 }
 
-/// The worker with texts and a key, or without one. What its copies hold, and what a life from the copies alone has.
+/// The worker with texts and a key, or without one. What its copies hold, and what a life from the
+/// copies alone has.
 async fn copies(with_key: bool) {
     let stage = Stage::new();
     let (main_log, log) = (stage.path("main.log"), stage.path("worker.log"));
@@ -256,10 +266,7 @@ async fn copies(with_key: bool) {
     everything(&stage, &robot, &worker, true).await;
     worker.has_kept_all(1).await;
     operator_sees_none(&worker, &[&main_log, &log]).await;
-    assert!(
-        keys(&robot.redis).contains(CANARY),
-        "services of this robot are to have it"
-    );
+    assert!(keys(&robot.redis).contains(CANARY), "services of this robot are to have it");
     // With a key the copies are encrypted as a whole.
     let is_readable = clean("the copies", &content(&stage.path("robot-1")));
     assert!(is_readable || with_key);
@@ -271,9 +278,7 @@ async fn copies(with_key: bool) {
     worker.kill();
     let worker = robot.worker(&stage);
     let mut service = robot.service().await;
-    let answer = service
-        .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
-        .await;
+    let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
     assert_eq!(answer["source"], "copy");
     assert_eq!(answer.to_string().contains(CANARY), with_key, "{answer}");
     let _main = stage.main();

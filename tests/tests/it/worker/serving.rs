@@ -33,10 +33,7 @@ async fn without_anything_the_mounted_file_serves_until_the_main_service_is_ther
         assert!(start.elapsed() < PATIENCE, "{}", worker.text("/readyz").await);
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    assert_eq!(
-        service.ask(asks.clone(), PATIENCE).await["config"]["camera"]["rate_hz"],
-        2
-    );
+    assert_eq!(service.ask(asks.clone(), PATIENCE).await["config"]["camera"]["rate_hz"], 2);
 
     let _main = stage.main();
     stage.robot().await;
@@ -61,17 +58,9 @@ mod quick {
         let mut service = stage.service().await;
         let (mut slam, mut nav) = (service.listen("slam").await, service.listen("nav").await);
 
-        let answer = service
-            .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
-            .await;
-        assert_eq!(
-            answer["config"],
-            json!({ "camera": { "rate_hz": 30 }, "verbosity": "info" })
-        );
-        assert_eq!(
-            (&answer["source"], &answer["node"]),
-            (&json!("main"), &json!("robot-1"))
-        );
+        let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
+        assert_eq!(answer["config"], json!({ "camera": { "rate_hz": 30 }, "verbosity": "info" }));
+        assert_eq!((&answer["source"], &answer["node"]), (&json!("main"), &json!("robot-1")));
         let effective = stage.get("/effective?service=slam&instance=0").await;
         assert_eq!(
             (&answer["hash"], &answer["config"]),
@@ -81,20 +70,14 @@ mod quick {
         assert_eq!(service.ask(again, PATIENCE).await["unchanged"], true);
         let misspelt = service.ask(json!({ "service": "slamm" }), PATIENCE).await;
         assert_eq!(misspelt["error"]["code"], "not_found");
-        assert!(
-            misspelt["error"]["detail"].as_str().unwrap().contains("slam?"),
-            "{misspelt}"
-        );
+        assert!(misspelt["error"]["detail"].as_str().unwrap().contains("slam?"), "{misspelt}");
 
         rest(&mut slam).await;
         rest(&mut nav).await;
         let instance = json!({ "node": "robot-1", "config": { "camera": { "rate_hz": 10 } } });
         let revision = stage.put("/services/slam/instances/0", instance).await;
         let notice = next(&mut slam).await;
-        assert_eq!(
-            (&notice["revision"], &notice["instance"]),
-            (&json!(revision), &json!("0"))
-        );
+        assert_eq!((&notice["revision"], &notice["instance"]), (&json!(revision), &json!("0")));
         assert_eq!(
             (&notice["paths"], &notice["scopes"]),
             (&json!(["/camera/rate_hz"]), &json!(["instance"]))
@@ -102,12 +85,7 @@ mod quick {
         assert_eq!(notice["previous_hash"], answer["hash"]);
         assert_eq!(notice["config"]["camera"]["rate_hz"], 10);
         // The key was written no later than the notice.
-        let key = stage
-            .keys()
-            .get("blaze:config:slam:0")
-            .await
-            .unwrap()
-            .expect("the key is there");
+        let key = stage.keys().get("blaze:config:slam:0").await.unwrap().expect("the key is there");
         let key: serde_json::Value = serde_json::from_slice(&key).unwrap();
         assert_eq!((&key["hash"], &key["config"]), (&notice["hash"], &notice["config"]));
 
@@ -122,10 +100,7 @@ mod quick {
         );
         let metrics = worker.text("/metrics").await;
         for line in ["blaze_worker_connected 1", "blaze_worker_source{source=\"main\"} 1"] {
-            assert!(
-                metrics.lines().any(|found| found == line),
-                "{line} is not in\n{metrics}"
-            );
+            assert!(metrics.lines().any(|found| found == line), "{line} is not in\n{metrics}");
         }
         worker.stop();
     }

@@ -1,4 +1,5 @@
-//! Two workers of one layer: one serves, and when it is killed, stopped or ended the other one does.
+//! Two workers of one layer: one serves, and when it is killed, stopped or ended the other one
+//! does.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -22,10 +23,8 @@ const GIVEN: Duration = Duration::from_secs(1);
 
 /// Two workers of a layer whose further sections these are, one of which leads: that one first.
 async fn two(stage: &Stage, sections: &Value) -> (Worker, Worker) {
-    let (one, other) = (
-        stage.layer_worker("fog-1", sections),
-        stage.layer_worker("fog-2", sections),
-    );
+    let (one, other) =
+        (stage.layer_worker("fog-1", sections), stage.layer_worker("fog-2", sections));
     stage.equal(&one, PATIENCE).await;
     stage.equal(&other, PATIENCE).await;
     let start = Instant::now();
@@ -34,12 +33,7 @@ async fn two(stage: &Stage, sections: &Value) -> (Worker, Worker) {
             (Some(true), Some(false)) => return (one, other),
             (Some(false), Some(true)) => return (other, one),
             (Some(true), Some(true)) => panic!("two lead"),
-            _ => assert!(
-                start.elapsed() < PATIENCE,
-                "none leads: {} {}",
-                one.tail(),
-                other.tail()
-            ),
+            _ => assert!(start.elapsed() < PATIENCE, "none leads: {} {}", one.tail(), other.tail()),
         }
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
@@ -54,9 +48,15 @@ async fn until_it_leads(worker: &Worker, since: Instant) -> Duration {
     since.elapsed()
 }
 
-/// The leader is killed, stopped, goes on, and is ended; each time the other one takes over within `lease` or, where it
-/// could say so, at once.
-async fn takeovers(name: &str, stage: &Stage, both: (Worker, Worker), sections: &Value, lease: Duration) {
+/// The leader is killed, stopped, goes on, and is ended; each time the other one takes over within
+/// `lease` or, where it could say so, at once.
+async fn takeovers(
+    name: &str,
+    stage: &Stage,
+    both: (Worker, Worker),
+    sections: &Value,
+    lease: Duration,
+) {
     let (leader, other) = both;
     let since = Instant::now();
     leader.kill();
@@ -84,7 +84,10 @@ async fn takeovers(name: &str, stage: &Stage, both: (Worker, Worker), sections: 
     let since = Instant::now();
     other.stop();
     let ended = until_it_leads(&leader, since).await;
-    println!("{name}: taken over {killed:?} after a kill, {stopped:?} after a stop, {ended:?} after an end");
+    println!(
+        "{name}: taken over {killed:?} after a kill, {stopped:?} after a stop, {ended:?} after an \
+         end"
+    );
     let (lost, given) = (lease + within(LOOK), within(GIVEN));
     assert!(killed <= lost, "after a kill {killed:?}, not {lost:?}");
     assert!(stopped <= lost, "after a stop {stopped:?}, not {lost:?}");
@@ -110,10 +113,7 @@ async fn with_redis_another_worker_takes_over_within_a_lease() {
     until_it_leads(&worker, Instant::now()).await;
     let owner = async || stage.keys().get("blaze:lease:worker:edge").await.unwrap();
     let status = worker.status().await;
-    assert_eq!(
-        owner().await.as_deref(),
-        Some(status["worker_id"].as_str().unwrap().as_bytes())
-    );
+    assert_eq!(owner().await.as_deref(), Some(status["worker_id"].as_str().unwrap().as_bytes()));
     worker.stop();
     assert_eq!(owner().await, None, "who ends gives it up");
 }
@@ -122,7 +122,8 @@ async fn with_redis_another_worker_takes_over_within_a_lease() {
 async fn with_mongodb_another_worker_takes_over_within_a_lease() {
     let (stage, _main) = stage().await;
     let server = MongoServer::start(MongoOptions::default()).unwrap();
-    let sections = json!({ "database": { "mongodb": { "uri": server.uri(), "database": "blaze" } } });
+    let sections =
+        json!({ "database": { "mongodb": { "uri": server.uri(), "database": "blaze" } } });
     let both = two(&stage, &sections).await;
     takeovers("MongoDB", &stage, both, &sections, LEASE).await;
 }
@@ -131,7 +132,8 @@ async fn with_mongodb_another_worker_takes_over_within_a_lease() {
 async fn with_kafka_another_worker_takes_over_within_its_session_timeout() {
     let (stage, _main) = stage().await;
     let server = KafkaServer::start(KafkaOptions::default()).unwrap();
-    let sections = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()] } } } });
+    let sections =
+        json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()] } } } });
     let both = two(&stage, &sections).await;
     one_answers(&server.bootstrap(), &both).await;
     takeovers("Kafka", &stage, both, &sections, LEASE_ON_KAFKA).await;
@@ -142,11 +144,14 @@ async fn one_answers(bootstrap: &str, (leader, other): &(Worker, Worker)) {
     let replies = KafkaReader::from_end(bootstrap, "blaze.reply").unwrap();
     let writer = KafkaWriter::new(bootstrap).unwrap();
     let ask = |id: &str| {
-        let request =
-            json!({ "id": id, "service": "slam", "instance": "0", "node": "robot-1", "reply_to": "blaze/reply/me" });
-        writer
-            .produce("blaze.config.get", request.to_string().as_bytes())
-            .unwrap();
+        let request = json!({
+            "id": id,
+            "service": "slam",
+            "instance": "0",
+            "node": "robot-1",
+            "reply_to": "blaze/reply/me",
+        });
+        writer.produce("blaze.config.get", request.to_string().as_bytes()).unwrap();
     };
     let left = async |worker: &Worker| {
         let metrics = worker.text("/metrics").await;
@@ -177,23 +182,18 @@ async fn one_answers(bootstrap: &str, (leader, other): &(Worker, Worker)) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn whoever_was_stopped_writes_nothing_older_over_what_the_next_one_wrote() {
     let (stage, _main) = stage().await;
-    let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } }, "worker": { "lease_ms": 1000 } });
+    let sections = json!({
+        "cache": { "redis": { "url": stage.redis.url() } },
+        "worker": { "lease_ms": 1000 },
+    });
     let (leader, other) = two(&stage, &sections).await;
     for round in 1..=3_u64 {
         // It is stopped with a change on its way.
-        stage
-            .put(
-                "/services/slam",
-                json!({ "config": { "camera": { "rate_hz": round } } }),
-            )
-            .await;
+        stage.put("/services/slam", json!({ "config": { "camera": { "rate_hz": round } } })).await;
         leader.signal(Signal::STOP);
         until_it_leads(&other, Instant::now()).await;
         let revision = stage
-            .put(
-                "/services/slam",
-                json!({ "config": { "camera": { "rate_hz": round + 100 } } }),
-            )
+            .put("/services/slam", json!({ "config": { "camera": { "rate_hz": round + 100 } } }))
             .await;
         let key = async || {
             let key = stage.keys().get("blaze:config:slam:0").await.unwrap();

@@ -8,7 +8,8 @@ use std::time::Duration;
 
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{
-    Broker, BrokerKind, Content, Health, PublisherOptions, Role, SubscribeOptions, Subscription, open_layer, open_node,
+    Broker, BrokerKind, Content, Health, PublisherOptions, Role, SubscribeOptions, Subscription,
+    open_layer, open_node,
 };
 use blaze_domain::config::merge::merge_patch;
 use blaze_domain::names::ChannelName;
@@ -67,7 +68,8 @@ pub(super) fn addresses(process: &Process) -> anyhow::Result<BTreeMap<String, So
         || process.tail(),
     )?;
     let words = line.split(' ').filter_map(|word| word.split_once('='));
-    let addresses = words.filter_map(|(name, address)| Some((name.to_owned(), address.parse().ok()?)));
+    let addresses =
+        words.filter_map(|(name, address)| Some((name.to_owned(), address.parse().ok()?)));
     Ok(addresses.collect())
 }
 
@@ -121,7 +123,8 @@ impl Stage {
             &json!({
                 "log": { "level": level },
                 "control_plane": {
-                    "rest": { "listen": self.rest }, "grpc": { "listen": self.grpc }, "admin": { "listen": "127.0.0.1:0" },
+                    "rest": { "listen": self.rest }, "grpc": { "listen": self.grpc },
+                    "admin": { "listen": "127.0.0.1:0" },
                     "store": { "sqlite": { "path": self.path("main.db") } },
                     "encryption": { "keys": [{ "id": "e1", "file": self.path("enc.key") }] },
                 },
@@ -144,14 +147,11 @@ impl Stage {
 
     /// The same with further members of the section `worker`.
     pub(crate) fn worker_with(&self, node: &str, section: &Value) -> Worker {
-        self.started(
-            node,
-            &self.node_file(node, &self.brokers, &json!({ "worker": section })),
-        )
+        self.started(node, &self.node_file(node, &self.brokers, &json!({ "worker": section })))
     }
 
-    /// A worker of the whole layer, ready, beside others; `more` are further sections. Its broker is in its own memory, unless
-    /// they name another: keys are enough to see who serves.
+    /// A worker of the whole layer, ready, beside others; `more` are further sections. Its broker
+    /// is in its own memory, unless they name another: keys are enough to see who serves.
     pub(crate) fn layer_worker(&self, node: &str, more: &Value) -> Worker {
         let memory = json!({ "layer": { "memory": {} } });
         let brokers = more.get("brokers").unwrap_or(&memory);
@@ -179,7 +179,12 @@ impl Stage {
     }
 
     /// A request to the main service that must succeed.
-    pub(crate) async fn send(&self, method: reqwest::Method, path: &str, body: Option<&Value>) -> Value {
+    pub(crate) async fn send(
+        &self,
+        method: reqwest::Method,
+        path: &str,
+        body: Option<&Value>,
+    ) -> Value {
         let mut request = self.http.request(method, format!("http://{}/api/v1{path}", self.rest));
         request = request.header("if-match", "*");
         if let Some(body) = body {
@@ -194,7 +199,9 @@ impl Stage {
     /// Applies documents: kind, name (of an instance `service/name`), spec.
     pub(crate) async fn apply(&self, documents: &[(&str, &str, Value)]) -> u64 {
         let documents = documents.iter().map(|(kind, name, spec)| match name.split_once('/') {
-            Some((service, name)) => json!({ "kind": kind, "service": service, "name": name, "spec": spec }),
+            Some((service, name)) => {
+                json!({ "kind": kind, "service": service, "name": name, "spec": spec })
+            }
             None => json!({ "kind": kind, "name": name, "spec": spec }),
         });
         let body = Value::Array(documents.collect());
@@ -203,9 +210,7 @@ impl Stage {
     }
 
     pub(crate) async fn put(&self, path: &str, spec: Value) -> u64 {
-        let answer = self
-            .send(reqwest::Method::PUT, path, Some(&json!({ "spec": spec })))
-            .await;
+        let answer = self.send(reqwest::Method::PUT, path, Some(&json!({ "spec": spec }))).await;
         answer["revision"].as_u64().unwrap()
     }
 
@@ -216,11 +221,7 @@ impl Stage {
     /// A robot with two services, of which one has an instance.
     pub(crate) async fn robot(&self) -> u64 {
         self.apply(&[
-            (
-                "Layer",
-                "edge",
-                json!({ "kind": "edge", "config": { "verbosity": "info" } }),
-            ),
+            ("Layer", "edge", json!({ "kind": "edge", "config": { "verbosity": "info" } })),
             ("Node", "robot-1", json!({ "layer": "edge" })),
             ("Service", "slam", json!({ "config": { "camera": { "rate_hz": 30 } } })),
             ("Service", "nav", json!({ "config": { "speed": 1 } })),
@@ -248,7 +249,9 @@ impl Stage {
         let start = tokio::time::Instant::now();
         loop {
             let (main, here) = (self.get("/digest?layer=edge").await, worker.status().await);
-            let is_equal = main["digest"] == here["digest"] && here["connected"] == true && here["source"] == "main";
+            let is_equal = main["digest"] == here["digest"]
+                && here["connected"] == true
+                && here["source"] == "main";
             if is_equal {
                 return main["digest"].as_str().unwrap().to_owned();
             }
@@ -353,10 +356,7 @@ async fn connected(brokers: &Value) -> Arc<dyn Broker> {
     };
     let mut status = broker.status();
     let up = status.wait_for(|status| status.health == Health::Up);
-    tokio::time::timeout(PATIENCE, up)
-        .await
-        .expect("the broker answers")
-        .unwrap();
+    tokio::time::timeout(PATIENCE, up).await.expect("the broker answers").unwrap();
     broker
 }
 
@@ -372,12 +372,7 @@ impl Service {
             BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => ChannelName::shared_reply(),
         };
         let replies = broker.subscribe(&reply, SubscribeOptions::default()).await.unwrap();
-        Self {
-            broker,
-            replies,
-            life: rand::random(),
-            asked: 0,
-        }
+        Self { broker, replies, life: rand::random(), asked: 0 }
     }
 
     /// Hears of changes of a service from now on.
@@ -387,10 +382,7 @@ impl Service {
 
     /// The same, beginning with what the broker keeps.
     pub(crate) async fn listen_late(&self, service: &str) -> Subscription {
-        let options = SubscribeOptions {
-            with_kept: true,
-            ..SubscribeOptions::default()
-        };
+        let options = SubscribeOptions { with_kept: true, ..SubscribeOptions::default() };
         self.listen_with(service, options).await
     }
 
@@ -401,23 +393,16 @@ impl Service {
 
     /// Says something on a channel.
     pub(crate) fn publish(&self, channel: &str, message: &Value) {
-        let publisher = self
-            .broker
-            .publisher(&channel.parse().unwrap(), PublisherOptions::default())
-            .unwrap();
+        let publisher =
+            self.broker.publisher(&channel.parse().unwrap(), PublisherOptions::default()).unwrap();
         publisher.publish_bare(&Bytes::from(message.to_string()), None);
     }
 
     /// Asks until it is answered, as often as a service may: each second.
     pub(crate) async fn ask(&mut self, mut request: Value, limit: Duration) -> Value {
-        let options = PublisherOptions {
-            reliable: true,
-            ..PublisherOptions::default()
-        };
-        let publisher = self
-            .broker
-            .publisher(&"blaze/config/get".parse().unwrap(), options)
-            .unwrap();
+        let options = PublisherOptions { reliable: true, ..PublisherOptions::default() };
+        let publisher =
+            self.broker.publisher(&"blaze/config/get".parse().unwrap(), options).unwrap();
         let start = tokio::time::Instant::now();
         loop {
             self.asked += 1;
@@ -457,9 +442,7 @@ fn text(content: &Content) -> Value {
 pub(crate) async fn next(notices: &mut Subscription) -> Value {
     let mut batch = Vec::new();
     let received = notices.receive(&mut batch, 1);
-    let count = tokio::time::timeout(PATIENCE, received)
-        .await
-        .expect("a notice in time");
+    let count = tokio::time::timeout(PATIENCE, received).await.expect("a notice in time");
     assert_eq!(count, 1);
     text(&batch[0].content)
 }
@@ -468,6 +451,7 @@ pub(crate) async fn next(notices: &mut Subscription) -> Value {
 pub(crate) async fn rest(notices: &mut Subscription) -> Vec<Value> {
     let mut batch = Vec::new();
     // What is there is taken at once.
-    let _ = tokio::time::timeout(Duration::from_millis(1), notices.receive(&mut batch, 10_000)).await;
+    let _ =
+        tokio::time::timeout(Duration::from_millis(1), notices.receive(&mut batch, 10_000)).await;
     batch.iter().map(|received| text(&received.content)).collect()
 }

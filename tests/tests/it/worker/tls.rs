@@ -1,5 +1,5 @@
-//! A main service that takes only tokens, and only from clients with a certificate: the whole way by the commands that an
-//! administrator types, up to a worker that syncs.
+//! A main service that takes only tokens, and only from clients with a certificate: the whole way
+//! by the commands that an administrator types, up to a worker that syncs.
 
 use std::process::{Command, Output};
 
@@ -33,12 +33,15 @@ impl Secured {
             "main.yaml",
             &json!({
                 "control_plane": {
-                    "rest": { "listen": self.stage.rest }, "grpc": { "listen": self.stage.grpc }, "admin": { "listen": "127.0.0.1:0" },
+                    "rest": { "listen": self.stage.rest }, "grpc": { "listen": self.stage.grpc },
+                    "admin": { "listen": "127.0.0.1:0" },
                     "store": { "sqlite": { "path": self.stage.path("main.db") } },
-                    "auth": { "keys": [{ "id": "k1", "alg": "EdDSA", "file": self.stage.path("k1.key"), "sign": true }] },
+                    "auth": { "keys": [{ "id": "k1", "alg": "EdDSA",
+                        "file": self.stage.path("k1.key"), "sign": true }] },
                     "encryption": { "keys": [{ "id": "e1", "file": self.stage.path("enc.key") }] },
                     "tls": {
-                        "cert_file": self.certificates.certificate, "key_file": self.certificates.key,
+                        "cert_file": self.certificates.certificate,
+                        "key_file": self.certificates.key,
                         "client_ca_file": self.certificates.authority,
                     },
                 },
@@ -78,9 +81,8 @@ impl Secured {
     /// What `blaze node join` prints, with these options besides.
     fn join(&self, more: &[&str]) -> Value {
         let (grpc, redis) = (format!("https://{}", self.stage.grpc), self.stage.redis.url());
-        let mut arguments = vec![
-            "node", "join", "robot-1", "--layer", "edge", "--grpc", &grpc, "-o", "json",
-        ];
+        let mut arguments =
+            vec!["node", "join", "robot-1", "--layer", "edge", "--grpc", &grpc, "-o", "json"];
         arguments.extend(["--node-broker", &redis, "--layer-broker", "none"]);
         arguments.extend(more);
         serde_json::from_str::<Value>(&self.admin(&arguments)).unwrap()["node_file"].take()
@@ -92,7 +94,8 @@ impl Secured {
         file["admin"] = json!({ "worker": "127.0.0.1:0" });
         file["state_dir"] = json!(self.stage.path("robot-1"));
         let file = self.stage.write("robot-1.yaml", &file);
-        Starting::of(Process::start("blaze-worker", &["--config", &file], None).unwrap()).listening()
+        Starting::of(Process::start("blaze-worker", &["--config", &file], None).unwrap())
+            .listening()
     }
 }
 
@@ -101,26 +104,22 @@ fn has_reason(words: &str) -> impl Fn(&Value) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_with_a_certificate_and_a_token_gets_secrets_and_one_without_is_told_what_is_missing() {
+async fn a_worker_with_a_certificate_and_a_token_gets_secrets_and_one_without_is_told_what_is_missing()
+ {
     let world = Secured::new();
     let _main = world.main();
     let own_key = ["--key-file", "k1.key", "--alg", "EdDSA", "--key-id", "k1"];
-    let token = [
-        "token",
-        "create",
-        "--subject",
-        "admin",
-        "--role",
-        "admin",
-        "--expires",
-        "1h",
-    ];
+    let token = ["token", "create", "--subject", "admin", "--role", "admin", "--expires", "1h"];
     let token = world.blaze(&[&token[..], &own_key[..]].concat());
     assert!(token.status.success(), "{token:?}");
     std::fs::write(world.stage.path("admin.token"), token.stdout).unwrap();
     let documents = json!([
         { "kind": "Layer", "name": "edge", "spec": { "kind": "edge" } },
-        { "kind": "Service", "name": "gate", "spec": { "config": { "rate_hz": 5, "password": { "$secret": SECRET } } } },
+        {
+            "kind": "Service",
+            "name": "gate",
+            "spec": { "config": { "rate_hz": 5, "password": { "$secret": SECRET } } },
+        },
     ]);
     let documents = world.stage.write("documents.yaml", &documents);
     world.admin(&["apply", "-f", &documents]);
@@ -148,14 +147,9 @@ async fn a_worker_with_a_certificate_and_a_token_gets_secrets_and_one_without_is
     let ended = tokio::task::block_in_place(|| worker.process.terminate(PATIENCE)).unwrap();
     assert_eq!(ended, Some(0));
     let worker = world.worker(&file);
-    worker
-        .until("why there is no connection", has_reason("no connection"))
-        .await;
+    worker.until("why there is no connection", has_reason("no connection")).await;
     let answer = service.ask(json!({ "service": "gate" }), PATIENCE).await;
-    assert_eq!(
-        (&answer["config"]["rate_hz"], &answer["source"]),
-        (&json!(9), &json!("copy"))
-    );
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(9), &json!("copy")));
     std::fs::write(&world.certificates.client_key, "nothing").unwrap();
     worker.until("which file it is", has_reason("config.key_file")).await;
 }

@@ -1,8 +1,9 @@
-//! Both ends of `Sync` across versions: what was recorded with the version before is understood by the main service and the
-//! worker of today, with more in it than they know, and versions that are too far apart are told so.
+//! Both ends of `Sync` across versions: what was recorded with the version before is understood by
+//! the main service and the worker of today, with more in it than they know, and versions that are
+//! too far apart are told so.
 //!
-//! The recordings are in `tests/fixtures/sync`. A new version of the protocol brings one of its own: `BLAZE_RECORD_SYNC=FILE`
-//! lets the first test write it.
+//! The recordings are in `tests/fixtures/sync`. A new version of the protocol brings one of its
+//! own: `BLAZE_RECORD_SYNC=FILE` lets the first test write it.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -19,7 +20,9 @@ use serde_json::{Value, json};
 
 use super::kit::Robot;
 use super::raw::{RawMain, RawStream, Session};
-use super::recorded::{Recorded, count, fixture, last_digest, read, said, told, with_unknown, write};
+use super::recorded::{
+    Recorded, count, fixture, last_digest, read, said, told, with_unknown, write,
+};
 use super::stage::{PATIENCE, Stage, Worker};
 
 /// The version that main service and worker of today speak.
@@ -27,7 +30,8 @@ const PROTOCOL: u32 = 2;
 /// What stands in the recordings as a secret.
 const CANARY: &str = "canary-of-the-wire";
 
-/// Passes one stream on, both ways, and notes what passes, until either end ends it or `is_over` says so.
+/// Passes one stream on, both ways, and notes what passes, until either end ends it or `is_over`
+/// says so.
 async fn pass(
     number: usize,
     session: Session,
@@ -64,8 +68,17 @@ async fn documents(stage: &Stage) {
     let documents = json!([
         { "kind": "Layer", "name": "edge", "spec": { "kind": "edge" } },
         { "kind": "Layer", "name": "fog", "spec": { "kind": "fog" } },
-        { "kind": "Node", "name": "robot-1", "labels": { "canary": "true" }, "spec": { "layer": "edge" } },
-        { "kind": "Service", "name": "slam", "spec": { "config": { "n": 1, "password": { "$secret": CANARY } } } },
+        {
+            "kind": "Node",
+            "name": "robot-1",
+            "labels": { "canary": "true" },
+            "spec": { "layer": "edge" },
+        },
+        {
+            "kind": "Service",
+            "name": "slam",
+            "spec": { "config": { "n": 1, "password": { "$secret": CANARY } } },
+        },
         { "kind": "Service", "name": "nav", "spec": { "config": { "n": 1 } } },
         { "kind": "Service", "name": "map", "spec": { "config": { "n": 1 } } },
         { "kind": "Instance", "service": "slam", "name": "0", "spec": { "node": "robot-1" } },
@@ -73,27 +86,25 @@ async fn documents(stage: &Stage) {
     stage.send(Method::POST, "/apply", Some(&documents)).await;
 }
 
-/// What happens while the first stream is open: every kind of change, a roll-out, and a service that says how it is.
+/// What happens while the first stream is open: every kind of change, a roll-out, and a service
+/// that says how it is.
 async fn changes(stage: &Stage, robot: &Robot, worker: &Worker) -> u64 {
     stage.put("/services/slam", json!({ "config": { "n": 2 } })).await;
     stage.send(Method::DELETE, "/services/nav", None).await;
-    stage
-        .put("/services/map", json!({ "config": { "n": 1 }, "layers": ["fog"] }))
-        .await;
+    stage.put("/services/map", json!({ "config": { "n": 1 }, "layers": ["fog"] })).await;
     let rollout = json!({ "name": "faster", "spec": {
         "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "n": 3 } },
-        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 600, "max_unhealthy": 0 },
+        "canary": { "node_selector": "canary=true" }, "gate": {
+            "window_s": 600,
+            "max_unhealthy": 0,
+        },
     } });
     stage.send(Method::POST, "/rollouts", Some(&rollout)).await;
     let ack = json!({ "service": "slam", "instance": "0", "node": "robot-1", "status": "applied" });
     let service = robot.service().await;
     service.publish("blaze/config/ack", &ack);
     let is_known = |status: &Value| {
-        status["services"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .any(|one| one["state"] == "ready")
+        status["services"].as_array().unwrap().iter().any(|one| one["state"] == "ready")
     };
     worker.until("the service is known", is_known).await;
     stage.get("/digest?layer=edge").await["revision"].as_u64().unwrap()
@@ -106,7 +117,8 @@ async fn what_is_said_today_is_recorded() {
     documents(&stage).await;
     let mut between = RawMain::start().await;
     let robot = Robot::new(&stage, "robot-1").with(&json!({
-        "config": { "server": format!("http://{}", between.address) }, "worker": { "deliver_secrets": true },
+        "config": { "server": format!("http://{}", between.address) },
+        "worker": { "deliver_secrets": true },
     }));
     let worker = robot.worker_unready(&stage);
     let session = between.session().await;
@@ -123,9 +135,7 @@ async fn what_is_said_today_is_recorded() {
     let changing = async {
         // It is ready when it has been told something, which the other future passes on.
         let worker = tokio::task::spawn_blocking(|| worker.ready()).await.unwrap();
-        worker
-            .until("the worker is in sync", |status| status["source"] == "main")
-            .await;
+        worker.until("the worker is in sync", |status| status["source"] == "main").await;
         let revision = changes(&stage, &robot, &worker).await;
         (worker, revision)
     };
@@ -134,7 +144,9 @@ async fn what_is_said_today_is_recorded() {
     let session = between.session().await;
     let passing = pass(1, session, stage.grpc, |recorded| count(recorded, "GoAway") > 0);
     let ending = async {
-        let is_there = |status: &Value| status["revision"].as_u64() >= Some(revision) && status["source"] == "main";
+        let is_there = |status: &Value| {
+            status["revision"].as_u64() >= Some(revision) && status["source"] == "main"
+        };
         worker.until("the worker is in sync again", is_there).await;
         main.ask_to_end().unwrap();
     };
@@ -143,10 +155,10 @@ async fn what_is_said_today_is_recorded() {
     for kind in ["Hello", "Ack", "Welcome", "Snapshot", "Commit", "Bookmark", "GoAway"] {
         assert!(count(&recorded, kind) > 0, "no {kind}");
     }
-    let resumed = recorded
-        .iter()
-        .filter(|one| one.stream == 1 && !one.by_worker)
-        .find_map(|one| match told(&one.bytes) {
+    let resumed =
+        recorded.iter().filter(|one| one.stream == 1 && !one.by_worker).find_map(|one| match told(
+            &one.bytes,
+        ) {
             Told::Welcome(welcome) => Some(welcome.resumed),
             _ => None,
         });
@@ -161,16 +173,16 @@ async fn what_is_said_today_is_recorded() {
 async fn is_served(stage: &Stage, recorded: &[Recorded], protocol: u32) {
     let mut of_first = recorded.iter().filter(|one| one.by_worker && one.stream == 0).cloned();
     let hello = of_first.next().unwrap();
-    let Said::Hello(greeting) = said(&hello.bytes) else {
-        panic!("Hello comes first")
-    };
+    let Said::Hello(greeting) = said(&hello.bytes) else { panic!("Hello comes first") };
     assert_eq!(greeting.protocol, protocol);
     let mut stream = RawStream::open(stage.grpc, with_unknown(&hello.bytes)).await.unwrap();
     let mut documents = 0;
     loop {
         let next = tokio::time::timeout(PATIENCE, stream.told.next()).await.unwrap();
         match told(&next.unwrap().unwrap()) {
-            Told::Welcome(welcome) => assert_eq!((welcome.protocol, welcome.resumed), (protocol, false)),
+            Told::Welcome(welcome) => {
+                assert_eq!((welcome.protocol, welcome.resumed), (protocol, false))
+            }
             Told::Snapshot(part) => documents += part.documents.len(),
             Told::Bookmark(bookmark) => {
                 assert!(bookmark.digest.starts_with("sha256:"));
@@ -192,10 +204,8 @@ async fn is_served(stage: &Stage, recorded: &[Recorded], protocol: u32) {
     loop {
         let workers = stage.get("/workers").await;
         let items = workers["items"].as_array().unwrap();
-        let known = items
-            .iter()
-            .find(|one| one["worker_id"] == greeting.worker_id.as_str())
-            .unwrap();
+        let known =
+            items.iter().find(|one| one["worker_id"] == greeting.worker_id.as_str()).unwrap();
         if known["revision"] == last.revision && known["digest"] == last.digest.as_str() {
             assert_eq!(
                 (&known["version"], &known["connected"]),
@@ -207,9 +217,7 @@ async fn is_served(stage: &Stage, recorded: &[Recorded], protocol: u32) {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     // And it goes on being told.
-    let revision = stage
-        .put("/services/slam", json!({ "config": { "n": 9 + protocol } }))
-        .await;
+    let revision = stage.put("/services/slam", json!({ "config": { "n": 9 + protocol } })).await;
     loop {
         let next = tokio::time::timeout(PATIENCE, stream.told.next()).await.unwrap();
         match told(&next.unwrap().unwrap()) {
@@ -238,11 +246,7 @@ async fn replay(session: &Session, recorded: &[Recorded], stream: usize) {
     for one in recorded.iter().filter(|one| !one.by_worker && one.stream == stream) {
         session.tell.send(Ok(with_unknown(&one.bytes))).await.unwrap();
         // A message of a kind that nobody knows.
-        session
-            .tell
-            .send(Ok(Bytes::from_static(&[0xfa, 0x01, 0x00])))
-            .await
-            .unwrap();
+        session.tell.send(Ok(Bytes::from_static(&[0xfa, 0x01, 0x00]))).await.unwrap();
     }
 }
 
@@ -261,7 +265,8 @@ async fn the_worker_understands_main_services_that_were_recorded() {
         let mut main = RawMain::start().await;
         // Secrets are redacted here; a main service of version 1 sends them all the same.
         let robot = Robot::new(&stage, "robot-1").with(&json!({
-            "config": { "server": format!("http://{}", main.address) }, "worker": { "deliver_secrets": false },
+            "config": { "server": format!("http://{}", main.address) },
+            "worker": { "deliver_secrets": false },
         }));
         let worker = robot.worker_unready(&stage);
         let mut first = main.session().await;
@@ -278,12 +283,11 @@ async fn the_worker_understands_main_services_that_were_recorded() {
         let greeting = hello(&mut second).await;
         assert!(greeting.revision > 0 && !greeting.store_id.is_empty(), "{greeting:?}");
         replay(&second, &recorded, 1).await;
-        let has_all = |status: &Value| status["digest"] == digest.as_str() && status["revision"] == revision;
+        let has_all =
+            |status: &Value| status["digest"] == digest.as_str() && status["revision"] == revision;
         worker.until("it has all that was recorded", has_all).await;
         let mut service = robot.service().await;
-        let answer = service
-            .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
-            .await;
+        let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
         assert_eq!(answer["config"]["n"], 3, "the roll-out counts: {answer}");
         for name in ["nav", "map"] {
             let answer = service.ask(json!({ "service": name }), PATIENCE).await;
@@ -291,9 +295,7 @@ async fn the_worker_understands_main_services_that_were_recorded() {
         }
         drop(second);
         let is_told = |status: &Value| {
-            status["reason"]
-                .as_str()
-                .is_some_and(|reason| reason.contains("ending"))
+            status["reason"].as_str().is_some_and(|reason| reason.contains("ending"))
         };
         worker.until("why the stream ended", is_told).await;
         assert!(!worker.status().await.to_string().contains(CANARY));

@@ -1,5 +1,6 @@
-//! The budget of a link under two saturating cameras: small topics keep their rate, images get what F9 gives them, and no second carries
-//! more than the limit. Each row is one combination of link, limit, sharing and compression.
+//! The budget of a link under two saturating cameras: small topics keep their rate, images get what
+//! F9 gives them, and no second carries more than the limit. Each row is one combination of link,
+//! limit, sharing and compression.
 
 use std::io::Write as _;
 use std::sync::OnceLock;
@@ -75,10 +76,7 @@ fn write_pictures() -> anyhow::Result<tempfile::NamedTempFile> {
     let mut written = 0;
     for recording in load_built_in()? {
         let camera = recording.topics.iter().position(|topic| topic.name.as_str() == CAMERA);
-        let pictures = recording
-            .messages
-            .iter()
-            .filter(|message| Some(message.topic) == camera);
+        let pictures = recording.messages.iter().filter(|message| Some(message.topic) == camera);
         for picture in pictures.take(PICTURES - written) {
             if let Body::Ready(pixels) = &picture.body {
                 anyhow::ensure!(pixels.len() == IMAGE, "a picture of {} bytes", pixels.len());
@@ -118,10 +116,7 @@ impl Row {
     }
 
     const fn fair(self) -> Self {
-        Self {
-            sharing: Sharing::Fair,
-            ..self
-        }
+        Self { sharing: Sharing::Fair, ..self }
     }
 
     const fn compressed(self, compression: &'static str) -> Self {
@@ -213,10 +208,7 @@ fn scenario_on(row: &Row, shape: Shape, cloud: BrokerKind) -> anyhow::Result<Sce
 }
 
 fn shape(row: &Row) -> Shape {
-    Shape {
-        rate: Some(row.link_mbit * 1_000_000),
-        ..Shape::to_cloud()
-    }
+    Shape { rate: Some(row.link_mbit * 1_000_000), ..Shape::to_cloud() }
 }
 
 fn allocation(running: &Running) -> anyhow::Result<Value> {
@@ -238,7 +230,12 @@ fn size(row: &Row, allocation: &Value, stream: &Stream) -> u64 {
 }
 
 /// The rates of F9 on what ω leaves of so many wire bytes per second.
-fn reckoned(row: &Row, wire_bytes_per_s: f64, wire_factor: f64, allocation: &Value) -> anyhow::Result<Vec<f64>> {
+fn reckoned(
+    row: &Row,
+    wire_bytes_per_s: f64,
+    wire_factor: f64,
+    allocation: &Value,
+) -> anyhow::Result<Vec<f64>> {
     let cloud: LayerName = "cloud".parse()?;
     let streams = streams()?;
     let demand = |stream: &Stream| Demand {
@@ -246,21 +243,11 @@ fn reckoned(row: &Row, wire_bytes_per_s: f64, wire_factor: f64, allocation: &Val
         size_bytes: size(row, allocation, stream),
         advertised_hz: stream.hz,
         class: None,
-        lanes: vec![LaneDemand {
-            layer: &cloud,
-            receiver: None,
-            max_rate_hz: None,
-        }],
+        lanes: vec![LaneDemand { layer: &cloud, receiver: None, max_rate_hz: None }],
     };
     let demands: Vec<Demand<'_>> = streams.iter().map(demand).collect();
-    let budgets = Budgets {
-        process: wire_bytes_per_s / wire_factor,
-        ..Budgets::default()
-    };
-    let terms = Terms {
-        sharing: row.sharing,
-        ..Terms::default()
-    };
+    let budgets = Budgets { process: wire_bytes_per_s / wire_factor, ..Budgets::default() };
+    let terms = Terms { sharing: row.sharing, ..Terms::default() };
     let topics = rates(&budgets, &terms, &demands).topics;
     Ok(topics.into_iter().map(|rates| rates.lanes_hz[0]).collect())
 }
@@ -269,7 +256,8 @@ fn reckoned(row: &Row, wire_bytes_per_s: f64, wire_factor: f64, allocation: &Val
 struct Seen {
     busiest: f64,
     mean: f64,
-    /// ω: wire bytes as the emulator counts them for each byte of `s · α` of the messages that came, whatever the flow says.
+    /// ω: wire bytes as the emulator counts them for each byte of `s · α` of the messages that
+    /// came, whatever the flow says.
     wire_factor: f64,
     lost_on_the_way: u64,
     /// Processor time of the robot's flow, per second.
@@ -281,10 +269,8 @@ struct Seen {
 impl Seen {
     /// Processor time of the robot's flow for each image that came, with all that it does besides.
     fn processor_per_image(&self) -> Duration {
-        let images = self
-            .routes
-            .iter()
-            .filter(|route| [FRONT, REAR].contains(&route.topic.as_str()));
+        let images =
+            self.routes.iter().filter(|route| [FRONT, REAR].contains(&route.topic.as_str()));
         let hz: f64 = images.map(Route::rate_hz).sum();
         Duration::from_secs_f64(self.processor / hz.max(1e-3))
     }
@@ -300,31 +286,34 @@ fn look(row: &Row, running: &Running, time: Duration) -> anyhow::Result<Seen> {
         std::thread::sleep(LOOK);
         readings.push(Reading::of(&link)?);
     }
-    let processor = (running.flow("robot-1")?.cpu()? - cpu).as_secs_f64() / begin.elapsed().as_secs_f64();
+    let processor =
+        (running.flow("robot-1")?.cpu()? - cpu).as_secs_f64() / begin.elapsed().as_secs_f64();
     let after = link.stats()?;
     let (streams, allocation) = (streams()?, allocation(running)?);
-    let routes = streams
-        .iter()
-        .map(|stream| running.route(consumer(stream), stream.topic, &since));
+    let routes = streams.iter().map(|stream| running.route(consumer(stream), stream.topic, &since));
     let routes: Vec<Route> = routes.collect::<anyhow::Result<_>>()?;
     let mean = readings[0].rate_to(&readings[readings.len() - 1]);
     let reckoned = streams.iter().zip(&routes);
     let reckoned: f64 = reckoned
-        .map(|(stream, route)| route.rate_hz() * size(row, &allocation, stream) as f64 * Terms::default().overhead)
+        .map(|(stream, route)| {
+            route.rate_hz() * size(row, &allocation, stream) as f64 * Terms::default().overhead
+        })
         .sum();
     Ok(Seen {
         busiest: busiest(&readings),
         mean,
         wire_factor: mean / reckoned.max(1.0),
-        lost_on_the_way: after.forward.dropped.total().packets - before.forward.dropped.total().packets,
+        lost_on_the_way: after.forward.dropped.total().packets
+            - before.forward.dropped.total().packets,
         processor,
         routes,
     })
 }
 
-/// Looks until no topic has grown meanwhile by what would show in the rates. Which picture is the largest of a topic shows late where few of
-/// them pass and LZ4 makes each another size, and how hard it tries depends on what the processor has to spare; who of two cameras is the
-/// larger one decides who gets the rest.
+/// Looks until no topic has grown meanwhile by what would show in the rates. Which picture is the
+/// largest of a topic shows late where few of them pass and LZ4 makes each another size, and how
+/// hard it tries depends on what the processor has to spare; who of two cameras is the larger one
+/// decides who gets the rest.
 fn look_at_settled(row: &Row, running: &Running) -> anyhow::Result<(Seen, Value)> {
     const LOOKS: usize = 15;
     const GROWN: f64 = IMAGE_RATE / 6.0;
@@ -336,11 +325,9 @@ fn look_at_settled(row: &Row, running: &Running) -> anyhow::Result<(Seen, Value)
         Ok([of(FRONT)?, of(REAR)?])
     };
     let is_settled = |before: [f64; 2], after: [f64; 2]| {
-        let grown = before
-            .iter()
-            .zip(after)
-            .map(|(before, after)| (after / before - 1.0).abs());
-        grown.fold(0.0, f64::max) <= GROWN && before[0].total_cmp(&before[1]) == after[0].total_cmp(&after[1])
+        let grown = before.iter().zip(after).map(|(before, after)| (after / before - 1.0).abs());
+        grown.fold(0.0, f64::max) <= GROWN
+            && before[0].total_cmp(&before[1]) == after[0].total_cmp(&after[1])
     };
     let mut before = sizes(&allocation(running)?)?;
     for _ in 0..LOOKS {
@@ -363,7 +350,8 @@ fn play(row: &Row) -> anyhow::Result<()> {
     let (seen, allocation) = look_at_settled(row, &running)?;
     let budget = row.budget();
     println!(
-        "{}: limit {:.1} Mbit/s; busiest second {:.2} %, mean {:.2} %; ω {:.4} on the wire, {} as the flow says; {} packets lost on the \
+        "{}: limit {:.1} Mbit/s; busiest second {:.2} %, mean {:.2} %; ω {:.4} on the wire, {} as \
+         the flow says; {} packets lost on the \
          way; processor {:.2}, {:.1} ms for each image",
         row.name,
         budget * 8.0 / 1e6,
@@ -381,10 +369,7 @@ fn play(row: &Row) -> anyhow::Result<()> {
             faults.push(what);
         }
     };
-    expect(
-        seen.busiest <= budget,
-        format!("{:.0} of {budget:.0} bytes in a second", seen.busiest),
-    );
+    expect(seen.busiest <= budget, format!("{:.0} of {budget:.0} bytes in a second", seen.busiest));
     expect(
         row.reported || seen.mean >= budget * USED,
         format!("only {:.0} of {budget:.0} bytes a second", seen.mean),
@@ -392,35 +377,27 @@ fn play(row: &Row) -> anyhow::Result<()> {
     let told = allocation["wire_factor"].as_f64().unwrap_or_default() * allocated(budget) / budget;
     expect(
         (told / seen.wire_factor - 1.0).abs() <= IMAGE_RATE,
-        format!(
-            "the flow takes {told:.4} for what the wire says is {:.4}",
-            seen.wire_factor
-        ),
+        format!("the flow takes {told:.4} for what the wire says is {:.4}", seen.wire_factor),
     );
     // What the reserve leaves is what is given out.
     let expected = reckoned(row, allocated(budget), seen.wire_factor, &allocation)?;
-    // And all of the limit, with ω as the flow has it: the one seen is off by an image, which is much of a few.
+    // And all of the limit, with ω as the flow has it: the one seen is off by an image, which is
+    // much of a few.
     let of_all = reckoned(row, budget, told, &allocation)?;
-    let lines = streams()?
-        .into_iter()
-        .zip(expected.into_iter().zip(of_all))
-        .zip(&seen.routes);
+    let lines = streams()?.into_iter().zip(expected.into_iter().zip(of_all)).zip(&seen.routes);
     for ((stream, (hz, of_all)), route) in lines {
         let topic = stream.topic;
         let got = route.rate_hz();
         let compression = &of_topic(&allocation, topic)["compression"];
         println!(
-            "  {topic:<34} reckoned {hz:>6.2} Hz (of the whole limit {of_all:>6.2}), got {got:>6.2} Hz; lost {:>3}, p50 {:>6.1} ms, p99 \
+            "  {topic:<34} reckoned {hz:>6.2} Hz (of the whole limit {of_all:>6.2}), got \
+             {got:>6.2} Hz; lost {:>3}, p50 {:>6.1} ms, p99 \
              {:>6.1} ms, dropped {} {}",
             route.gaps(),
             route.latency_ms(0.5).unwrap_or_default(),
             route.latency_ms(0.99).unwrap_or_default(),
             dropped(&running, topic)?,
-            if compression.is_null() {
-                String::new()
-            } else {
-                compression.to_string()
-            },
+            if compression.is_null() { String::new() } else { compression.to_string() },
         );
         // A message more or less may fall into the time that is looked at.
         let edge = 1.0 / route.seconds.max(1) as f64;
@@ -444,13 +421,7 @@ fn play(row: &Row) -> anyhow::Result<()> {
             );
         }
     }
-    anyhow::ensure!(
-        faults.is_empty(),
-        "{}: {}\n{}",
-        row.name,
-        faults.join("; "),
-        running.tails()
-    );
+    anyhow::ensure!(faults.is_empty(), "{}: {}\n{}", row.name, faults.join("; "), running.tails());
     Ok(())
 }
 
@@ -497,7 +468,8 @@ fn the_rate_follows_what_the_link_carries() -> anyhow::Result<()> {
         last = now;
     }
     println!(
-        "10 instead of 40 Mbit/s: measured {}, longest queue {longest:.0} ms from the fifth second on; back at 90 % after {back:?}",
+        "10 instead of 40 Mbit/s: measured {}, longest queue {longest:.0} ms from the fifth second \
+         on; back at 90 % after {back:?}",
         narrow["links"]
     );
     anyhow::ensure!(longest <= 100.0, "the queue holds {longest:.0} ms\n{}", running.tails());
@@ -508,19 +480,13 @@ fn the_rate_follows_what_the_link_carries() -> anyhow::Result<()> {
 /// How fast a change of the node file is in effect.
 const IN_EFFECT: Duration = Duration::from_secs(1);
 
-/// Another limit in the node file of a running flow: the rates follow, and no small message is lost.
+/// Another limit in the node file of a running flow: the rates follow, and no small message is
+/// lost.
 #[test]
 fn the_limit_changes_while_the_flow_runs() -> anyhow::Result<()> {
-    let limits = if long() {
-        [160.0, 40.0, 160.0]
-    } else {
-        [80.0, 40.0, 80.0]
-    };
+    let limits = if long() { [160.0, 40.0, 160.0] } else { [80.0, 40.0, 80.0] };
     let of = |limit_mbps| Row { limit_mbps, ..FULL };
-    let wide = Shape {
-        rate: None,
-        ..Shape::to_cloud()
-    };
+    let wide = Shape { rate: None, ..Shape::to_cloud() };
     let mut running = Running::start(&scenario(&of(limits[0]), wide)?)?;
     running.wait_flowing()?;
     std::thread::sleep(SETTLE);
@@ -528,7 +494,8 @@ fn the_limit_changes_while_the_flow_runs() -> anyhow::Result<()> {
     let since = running.now();
     for limit in &limits[1..] {
         let row = of(*limit);
-        // The same traffic costs the same before and after; that this is what the wire says, the rows show.
+        // The same traffic costs the same before and after; that this is what the wire says, the
+        // rows show.
         let before = allocation(&running)?;
         let wire_factor = before["wire_factor"].as_f64().context("it has measured")?;
         let expected = reckoned(&row, row.budget(), wire_factor, &before)?;
@@ -536,9 +503,7 @@ fn the_limit_changes_while_the_flow_runs() -> anyhow::Result<()> {
         running.edit("robot-1", |spec| spec.limit_mbps = *limit)?;
         let mut seen = Value::Null;
         let rate = |seen: &Value, topic| {
-            of_topic(seen, topic)["lanes"][0]["allocated_hz"]
-                .as_f64()
-                .unwrap_or_default()
+            of_topic(seen, topic)["lanes"][0]["allocated_hz"].as_f64().unwrap_or_default()
         };
         wait::until(
             &format!("limit_mbps {limit} is in effect, which gives {expected:.2?} Hz"),
@@ -547,12 +512,15 @@ fn the_limit_changes_while_the_flow_runs() -> anyhow::Result<()> {
                 seen = allocation(&running).unwrap_or_default();
                 let mut as_expected = streams().unwrap_or_default().into_iter().zip(&expected);
                 seen["limit_mbps"] == *limit
-                    && as_expected.all(|(stream, hz)| (rate(&seen, stream.topic) - hz).abs() <= IMAGE_RATE * hz)
+                    && as_expected.all(|(stream, hz)| {
+                        (rate(&seen, stream.topic) - hz).abs() <= IMAGE_RATE * hz
+                    })
             },
             || format!("{}\n{}", allocation(&running).unwrap_or_default(), running.tails()),
         )?;
         println!(
-            "limit_mbps {limit}: in effect after {:.0?}, {FRONT} from {:.3} to {:.3} Hz, {REAR} from {:.3} to {:.3} Hz",
+            "limit_mbps {limit}: in effect after {:.0?}, {FRONT} from {:.3} to {:.3} Hz, {REAR} \
+             from {:.3} to {:.3} Hz",
             begun.elapsed(),
             rate(&before, FRONT),
             rate(&seen, FRONT),
@@ -585,7 +553,8 @@ fn the_limit_changes_while_the_flow_runs() -> anyhow::Result<()> {
 /// How long small messages are worth anything.
 const SMALL_LIFESPAN: Duration = Duration::from_secs(2);
 
-/// The link is cut for longer than the time after which a flow counts as down, while cameras would fill it.
+/// The link is cut for longer than the time after which a flow counts as down, while cameras would
+/// fill it.
 #[test]
 fn small_topics_are_back_a_second_after_a_cut() -> anyhow::Result<()> {
     let mut scenario = scenario(&NARROW, shape(&NARROW))?;
@@ -602,7 +571,8 @@ fn small_topics_are_back_a_second_after_a_cut() -> anyhow::Result<()> {
     let topics: Vec<&'static str> = small().iter().map(|stream| stream.topic).collect();
     let healed = watch(&running, Ways::Both, &topics, &arrived)?;
     println!(
-        "  first Hello {:.0?} after it was healed, flowing after {:.0?}; busiest second {:.1} % of the limit",
+        "  first Hello {:.0?} after it was healed, flowing after {:.0?}; busiest second {:.1} % of \
+         the limit",
         healed.hello,
         healed.flowing,
         100.0 * healed.busiest / NARROW.budget()
@@ -612,7 +582,8 @@ fn small_topics_are_back_a_second_after_a_cut() -> anyhow::Result<()> {
         "the catch-up takes {:.0} bytes a second",
         healed.busiest
     );
-    // From now on all of them have their rate, though the link has just begun to show what it carries.
+    // From now on all of them have their rate, though the link has just begun to show what it
+    // carries.
     let back = running.now();
     std::thread::sleep(measured() / 2);
     for stream in streams()? {
@@ -657,21 +628,19 @@ fn small_topics_are_back_a_second_after_a_cut() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What saturating cameras add to the latency of small messages, over a link of 25 ms without jitter. The bar is for a machine that has
-/// nothing else to do.
+/// What saturating cameras add to the latency of small messages, over a link of 25 ms without
+/// jitter. The bar is for a machine that has nothing else to do.
 #[test]
 fn small_messages_do_not_wait_behind_images() -> anyhow::Result<()> {
     const ADDED: Duration = Duration::from_millis(2);
-    let steady = Shape {
-        jitter: Duration::ZERO,
-        loss: 0.0,
-        ..shape(&NARROW)
-    };
+    let steady = Shape { jitter: Duration::ZERO, loss: 0.0, ..shape(&NARROW) };
     // A part of an image on the wire: what a small message may find before it.
-    let chunk = Duration::from_secs_f64(f64::from(steady.mtu) * 8.0 / (NARROW.link_mbit as f64 * 1e6));
+    let chunk =
+        Duration::from_secs_f64(f64::from(steady.mtu) * 8.0 / (NARROW.link_mbit as f64 * 1e6));
     let mut p99 = Vec::new();
     for cameras in [false, true] {
-        // What Kafka does to small messages while it takes images, and on the cores that it shares with the flows, is not the link's.
+        // What Kafka does to small messages while it takes images, and on the cores that it shares
+        // with the flows, is not the link's.
         let mut scenario = scenario_on(&NARROW, steady, BrokerKind::Redis)?;
         if !cameras {
             scenario.publishers.truncate(1);
@@ -687,15 +656,13 @@ fn small_messages_do_not_wait_behind_images() -> anyhow::Result<()> {
             latencies.extend(running.route("recorder", stream.topic, &since)?.latencies_ms);
         }
         latencies.sort_by(f64::total_cmp);
-        let route = Route {
-            latencies_ms: latencies,
-            ..Route::default()
-        };
+        let route = Route { latencies_ms: latencies, ..Route::default() };
         p99.push(route.latency_ms(0.99).context("nothing arrived")?);
     }
     let (without, with) = (p99[0], p99[1]);
     println!(
-        "p99 of small messages: {without:.2} ms without cameras, {with:.2} ms beside them; allowed {:.2} ms more",
+        "p99 of small messages: {without:.2} ms without cameras, {with:.2} ms beside them; allowed \
+         {:.2} ms more",
         (ADDED + chunk).as_secs_f64() * 1e3
     );
     if long() {

@@ -15,9 +15,7 @@ const SOON: Duration = Duration::from_secs(5);
 const HEADERS: u64 = 28;
 
 fn two(forward: Shape, back: Shape) -> anyhow::Result<Topology> {
-    let plan = Plan::new()
-        .with_hosts(&["a", "b"])
-        .with_asymmetric_link("a", "b", forward, back);
+    let plan = Plan::new().with_hosts(&["a", "b"]).with_asymmetric_link("a", "b", forward, back);
     Topology::build(&plan)
 }
 
@@ -33,13 +31,14 @@ fn a_round_trip_takes_both_delays() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Sends twice the rate for some seconds and compares what comes out, by both counters, with the rate.
-/// Gives the two shares of the rate.
+/// Sends twice the rate for some seconds and compares what comes out, by both counters, with the
+/// rate. Gives the two shares of the rate.
 fn blast(rate: u64) -> anyhow::Result<[f64; 2]> {
     const PAYLOAD: usize = 1_372;
     let shape = Shape {
         rate: Some(rate),
-        // 0.3 s: longer than the sender waits for the processor on a busy machine, so that the link is never idle.
+        // 0.3 s: longer than the sender waits for the processor on a busy machine, so that the link
+        // is never idle.
         queue: rate * 3 / 80,
         delay: 25 * MS,
         ..Shape::default()
@@ -53,10 +52,7 @@ fn blast(rate: u64) -> anyhow::Result<[f64; 2]> {
     let measured = std::thread::scope(|scope| -> anyhow::Result<_> {
         let sender = scope.spawn(|| sink.send(&from, (seconds + 1) * packets_per_s, PAYLOAD, gap));
         // From when the queue is full on.
-        let full = || {
-            link.stats()
-                .is_ok_and(|stats| stats.forward.dropped.queue.packets > 100)
-        };
+        let full = || link.stats().is_ok_and(|stats| stats.forward.dropped.queue.packets > 100);
         wait::until("a full queue", SOON, full, || format!("{:?}", link.stats()))?;
         let look = || {
             anyhow::Ok((
@@ -74,17 +70,17 @@ fn blast(rate: u64) -> anyhow::Result<[f64; 2]> {
     })?;
     let stats = link.stats()?.forward;
     let shares = measured.map(|bits| bits / rate as f64);
-    println!("twice {rate} bit/s: {shares:?} of it leaves the emulator and enters the host; {stats:?}");
-    assert_eq!(
-        stats.taken,
-        stats.out + stats.dropped.total() + stats.queue + stats.flying
+    println!(
+        "twice {rate} bit/s: {shares:?} of it leaves the emulator and enters the host; {stats:?}"
     );
+    assert_eq!(stats.taken, stats.out + stats.dropped.total() + stats.queue + stats.flying);
     Ok(shares)
 }
 
-/// Two attempts may fail: a machine that keeps the sender or the emulator from the processor for longer than the queue lasts
-/// leaves the link idle, and one that does so between clock and counter measures something else. That the rate is never
-/// exceeded is shown without a machine in the tests of the direction.
+/// Two attempts may fail: a machine that keeps the sender or the emulator from the processor for
+/// longer than the queue lasts leaves the link idle, and one that does so between clock and counter
+/// measures something else. That the rate is never exceeded is shown without a machine in the tests
+/// of the direction.
 #[test]
 fn the_rate_cuts_a_blast_to_size() -> anyhow::Result<()> {
     for rate in [10_000_000, 160_000_000] {
@@ -103,7 +99,9 @@ fn a_cut_is_one_way_or_both_and_heals() -> anyhow::Result<()> {
     let network = two(Shape::default(), Shape::default())?;
     let (a, b) = (network.host("a")?, network.host("b")?);
     let link = network.link("a", "b")?;
-    let reach = || -> anyhow::Result<(bool, bool)> { Ok((reaches(a, b)?.is_some(), reaches(b, a)?.is_some())) };
+    let reach = || -> anyhow::Result<(bool, bool)> {
+        Ok((reaches(a, b)?.is_some(), reaches(b, a)?.is_some()))
+    };
     assert_eq!(reach()?, (true, true));
     link.cut(Ways::Forward)?;
     assert_eq!(reach()?, (false, true));

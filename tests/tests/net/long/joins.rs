@@ -1,4 +1,5 @@
-//! Many nodes join at once, each in a namespace of its own, and ask for what is flowing: those who had it go on having it.
+//! Many nodes join at once, each in a namespace of its own, and ask for what is flowing: those who
+//! had it go on having it.
 
 use std::time::{Duration, Instant};
 
@@ -14,23 +15,27 @@ use serde_json::{Value, json};
 const NODES: usize = 13;
 const TOPIC: &str = "imu/data";
 const DOMAIN: u16 = 20;
-/// The longest time that the route may be silent; its messages come every 20 ms. Beyond it counts what the machine had nobody
-/// do anything: all nodes start on the same processors here.
+/// The longest time that the route may be silent; its messages come every 20 ms. Beyond it counts
+/// what the machine had nobody do anything: all nodes start on the same processors here.
 const GAP: Duration = Duration::from_millis(200);
 const SOON: Duration = Duration::from_secs(30);
 /// After the last one has what it asked for.
 const AFTER: Duration = Duration::from_secs(3);
 
 fn redis(host: &Host) -> anyhow::Result<RedisServer> {
-    let options = RedisOptions {
-        host: Some(host.clone()),
-        ..RedisOptions::default()
-    };
+    let options = RedisOptions { host: Some(host.clone()), ..RedisOptions::default() };
     RedisServer::start(RedisKind::Redis, options)
 }
 
 fn lease(op: &str) -> Value {
-    json!({"op":op,"topic":TOPIC,"service":"test","reliability":"reliable","lifespan_ms":1000,"ttl_s":0})
+    json!({
+        "op":op,
+        "topic":TOPIC,
+        "service":"test",
+        "reliability":"reliable",
+        "lifespan_ms":1000,
+        "ttl_s":0,
+    })
 }
 
 /// Messages that a node's flow has written to its Redis.
@@ -59,9 +64,12 @@ fn nodes_that_join_at_once_disturb_nobody() -> anyhow::Result<()> {
         ..KafkaOptions::default()
     })?;
     let seed = [cloud_host.address];
-    let spec = |layer: &str, host: &Host| FlowSpec::new(layer, &host.name).joined(DOMAIN).inside(host, &seed);
+    let spec = |layer: &str, host: &Host| {
+        FlowSpec::new(layer, &host.name).joined(DOMAIN).inside(host, &seed)
+    };
     let mut robot = FlowProcess::launch(spec("edge", robot_host).on_redis(&robot_redis.url(), ""))?;
-    let mut cloud = FlowProcess::launch(spec("cloud", cloud_host).on_kafka(&kafka.bootstrap(), ""))?;
+    let mut cloud =
+        FlowProcess::launch(spec("cloud", cloud_host).on_kafka(&kafka.bootstrap(), ""))?;
     robot.wait_ready()?;
     cloud.wait_ready()?;
     let tell = |host: &Host, redis: &RedisServer, message: Value| {
@@ -79,10 +87,8 @@ fn nodes_that_join_at_once_disturb_nobody() -> anyhow::Result<()> {
         320,
     )?;
     stream.wait_fresh(SOON)?;
-    let servers: Vec<RedisServer> = names
-        .iter()
-        .map(|name| redis(network.host(name)?))
-        .collect::<anyhow::Result<_>>()?;
+    let servers: Vec<RedisServer> =
+        names.iter().map(|name| redis(network.host(name)?)).collect::<anyhow::Result<_>>()?;
     let calm = Instant::now();
     stream.wait_fresh(SOON)?;
     // As long as before the join, to compare with.
@@ -102,13 +108,7 @@ fn nodes_that_join_at_once_disturb_nobody() -> anyhow::Result<()> {
         "every node has what it asked for",
         SOON,
         || flows.iter().all(|flow| delivered(flow) > 0),
-        || {
-            format!(
-                "{:?}\n{}",
-                flows.iter().map(delivered).collect::<Vec<_>>(),
-                robot.tail()
-            )
-        },
+        || format!("{:?}\n{}", flows.iter().map(delivered).collect::<Vec<_>>(), robot.tail()),
     )?;
     let served = joined.elapsed();
     wait::until(
@@ -122,7 +122,9 @@ fn nodes_that_join_at_once_disturb_nobody() -> anyhow::Result<()> {
     let (before, during) = (stream.gap(calm, joined), stream.gap(joined, end));
     let (twice, reordered) = stream.faults();
     println!(
-        "{NODES} nodes joined at once and had the topic after {served:.1?}: longest gap {during:.0?}, before {before:.0?}, the machine was late by {late:.0?}; {} came, twice {}, out of order {reordered}",
+        "{NODES} nodes joined at once and had the topic after {served:.1?}: longest gap \
+         {during:.0?}, before {before:.0?}, the machine was late by {late:.0?}; {} came, twice {}, \
+         out of order {reordered}",
         stream.arrivals().len(),
         twice.len()
     );

@@ -1,4 +1,5 @@
-//! Tests that run with `scripts/test --long` alone: what measures for minutes, and the harness itself.
+//! Tests that run with `scripts/test --long` alone: what measures for minutes, and the harness
+//! itself.
 
 mod budget;
 mod emulator;

@@ -1,4 +1,5 @@
-//! The whole system under a mixed load, with faults drawn from a seed, for as long as is wanted. `scripts/soak` runs it alone.
+//! The whole system under a mixed load, with faults drawn from a seed, for as long as is wanted.
+//! `scripts/soak` runs it alone.
 
 use std::time::Duration;
 
@@ -21,11 +22,7 @@ const CALM: Duration = Duration::from_secs(5);
 /// After the last one: everything is back by then, and flows.
 const QUIET: Duration = Duration::from_secs(20);
 /// A flow or server may hold so much more in the end than once it was warm.
-const GROWTH: Usage = Usage {
-    resident_kib: 64 * 1024,
-    threads: 6,
-    descriptors: 24,
-};
+const GROWTH: Usage = Usage { resident_kib: 64 * 1024, threads: 6, descriptors: 24 };
 
 /// From the environment, or what the gate runs.
 #[allow(
@@ -55,18 +52,10 @@ fn draw(random: &mut StdRng) -> anyhow::Result<(Fault, Duration, Option<Fault>)>
                 Change::Rate(Some(8_000_000)),
             ];
             let good = Shape::to_cloud().changes();
-            (
-                Fault::Set(a, b, ways, bad),
-                time(1_000, 6_000),
-                Some(Fault::Set(a, b, ways, good)),
-            )
+            (Fault::Set(a, b, ways, bad), time(1_000, 6_000), Some(Fault::Set(a, b, ways, good)))
         }
         2 => (Fault::KillFlow(flow), time(100, 4_000), Some(Fault::StartFlow(flow))),
-        3 => (
-            Fault::FreezeBroker(broker),
-            time(200, 4_000),
-            Some(Fault::ThawBroker(broker)),
-        ),
+        3 => (Fault::FreezeBroker(broker), time(200, 4_000), Some(Fault::ThawBroker(broker))),
         _ => (Fault::RestartBroker(broker), time(200, 1_000), None),
     })
 }

@@ -1,4 +1,5 @@
-//! Networks of namespaces: everybody reaches everybody, multicast stays where it belongs, and nothing is left behind.
+//! Networks of namespaces: everybody reaches everybody, multicast stays where it belongs, and
+//! nothing is left behind.
 
 use std::net::{Ipv4Addr, UdpSocket};
 use std::process::{Command, Stdio};
@@ -12,7 +13,8 @@ use crate::support::reaches;
 
 const MULTICAST: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
 
-/// Two robots and a router on one switch, a fog of two behind another router, and a cloud on two links.
+/// Two robots and a router on one switch, a fog of two behind another router, and a cloud on two
+/// links.
 fn plan() -> Plan {
     let delay = |ms| Shape::default().with(Change::Delay(Duration::from_millis(ms)));
     Plan::new()
@@ -92,24 +94,18 @@ fn nothing_is_left_of_a_process_that_was_killed() -> anyhow::Result<()> {
     use std::io::{BufRead as _, BufReader};
 
     let mut child = Command::new(std::env::current_exe()?)
-        .args([
-            "long::topology::a_network_that_waits",
-            "--exact",
-            "--ignored",
-            "--nocapture",
-        ])
+        .args(["long::topology::a_network_that_waits", "--exact", "--ignored", "--nocapture"])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()?;
     let output = child.stdout.take().ok_or_else(|| anyhow::anyhow!("no pipe"))?;
     let lines = BufReader::new(output).lines().map_while(Result::ok);
-    let names = lines.filter_map(|line| line.split_once("namespace ").map(|(_, name)| name.to_owned()));
+    let names =
+        lines.filter_map(|line| line.split_once("namespace ").map(|(_, name)| name.to_owned()));
     let names: Vec<String> = names.take(2).collect();
     assert_eq!(names.len(), 2);
     assert!(
-        names
-            .iter()
-            .all(|name| namespaces().is_ok_and(|there| there.contains(name))),
+        names.iter().all(|name| namespaces().is_ok_and(|there| there.contains(name))),
         "{names:?}"
     );
     child.kill()?;

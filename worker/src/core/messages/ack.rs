@@ -82,14 +82,8 @@ mod tests {
             (json!({"status": "applied"}), "service: "),
             (json!({"service": "slam"}), "status: "),
             (json!({"service": "slam", "status": "fine"}), "status: "),
-            (
-                json!({"service": "slam", "status": "applied", "revision": -1}),
-                "revision: ",
-            ),
-            (
-                json!({"service": "slam", "status": "applied", "revision": 1.5}),
-                "revision: ",
-            ),
+            (json!({"service": "slam", "status": "applied", "revision": -1}), "revision: "),
+            (json!({"service": "slam", "status": "applied", "revision": 1.5}), "revision: "),
             (json!({"service": "slam", "status": "applied", "node": "A"}), "node: "),
             (json!([]), "the message: "),
         ] {

@@ -15,17 +15,15 @@ pub const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 /// In words that follow "the message", never with a value of it.
 pub(super) fn object(bytes: &[u8]) -> Result<Map<String, Value>, String> {
     if bytes.len() > MAX_MESSAGE_BYTES {
-        return Err(format!(
-            "has {} bytes, at most {MAX_MESSAGE_BYTES} are allowed",
-            bytes.len()
-        ));
+        return Err(format!("has {} bytes, at most {MAX_MESSAGE_BYTES} are allowed", bytes.len()));
     }
-    // Where a member is given twice, the last one counts: whoever sent it gets an answer instead of silence.
+    // Where a member is given twice, the last one counts: whoever sent it gets an answer instead of
+    // silence.
     match serde_json::from_slice::<Value>(bytes) {
         Ok(Value::Object(members)) => Ok(members),
-        Ok(Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Array(_)) => {
-            Err("is no JSON object".to_owned())
-        }
+        Ok(
+            Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Array(_),
+        ) => Err("is no JSON object".to_owned()),
         Err(error) => Err(format!("is no JSON: line {} column {}", error.line(), error.column())),
     }
 }
@@ -51,10 +49,9 @@ pub(super) fn text<'m>(
 ) -> Result<Option<&'m str>, String> {
     match members.get(name) {
         None | Some(Value::Null) => Ok(None),
-        Some(Value::String(text)) if text.len() > max_bytes => Err(format!(
-            "{name}: has {} bytes, at most {max_bytes} are allowed",
-            text.len()
-        )),
+        Some(Value::String(text)) if text.len() > max_bytes => {
+            Err(format!("{name}: has {} bytes, at most {max_bytes} are allowed", text.len()))
+        }
         Some(Value::String(text)) if text.chars().any(char::is_control) => {
             Err(format!("{name}: holds control characters"))
         }
@@ -74,8 +71,7 @@ where
     T: FromStr<Err: Display>,
 {
     let text = text(members, name, 1024)?;
-    text.map(|text| text.parse().map_err(|error| format!("{name}: {error}")))
-        .transpose()
+    text.map(|text| text.parse().map_err(|error| format!("{name}: {error}"))).transpose()
 }
 
 /// A whole number that is not negative, also as a text: the fields of a Redis hash are texts.

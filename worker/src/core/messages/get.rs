@@ -50,10 +50,7 @@ pub struct RequestError {
 impl RequestError {
     /// An error.
     pub(crate) fn new(code: ErrorCode, detail: impl Into<String>) -> Self {
-        Self {
-            code,
-            detail: detail.into(),
-        }
+        Self { code, detail: detail.into() }
     }
 }
 
@@ -79,8 +76,8 @@ pub struct GetRequest {
 pub struct RefusedRequest {
     /// Is echoed, if it could be read.
     pub id: Option<String>,
-    /// Where the refusal goes; `None`: nowhere, because the request does not say, or names a place where answers must not
-    /// go: whoever can send requests could otherwise write to any topic.
+    /// Where the refusal goes; `None`: nowhere, because the request does not say, or names a place
+    /// where answers must not go: whoever can send requests could otherwise write to any topic.
     pub reply_to: Option<ChannelName>,
     /// What is wrong.
     pub error: RequestError,
@@ -92,12 +89,14 @@ impl GetRequest {
     /// # Errors
     /// What is wrong, and where to say so.
     pub fn parse(bytes: &[u8]) -> Result<Self, RefusedRequest> {
-        let refused = |id: Option<&str>, reply_to: Option<ChannelName>, detail: String| RefusedRequest {
-            id: id.map(str::to_owned),
-            reply_to,
-            error: RequestError::new(ErrorCode::InvalidRequest, detail),
-        };
-        let members = object(bytes).map_err(|detail| refused(None, None, format!("the request {detail}")))?;
+        let refused =
+            |id: Option<&str>, reply_to: Option<ChannelName>, detail: String| RefusedRequest {
+                id: id.map(str::to_owned),
+                reply_to,
+                error: RequestError::new(ErrorCode::InvalidRequest, detail),
+            };
+        let members =
+            object(bytes).map_err(|detail| refused(None, None, format!("the request {detail}")))?;
         // First what an answer needs, so that every later fault can be answered.
         let id = text(&members, "id", MAX_ID_BYTES);
         let known_id = id.as_ref().ok().copied().flatten();
@@ -186,13 +185,11 @@ mod tests {
             ("hash", json!(false)),
             ("hash", json!("x".repeat(MAX_HASH_BYTES + 1))),
         ] {
-            let mut request = json!({"id": "7f1c", "service": "slam", "reply_to": "blaze/reply/me"});
+            let mut request =
+                json!({"id": "7f1c", "service": "slam", "reply_to": "blaze/reply/me"});
             request[member] = value;
             let refused = parse(&request).unwrap_err();
-            assert_eq!(
-                refused.reply_to.as_ref().map(ChannelName::as_str),
-                Some("blaze/reply/me")
-            );
+            assert_eq!(refused.reply_to.as_ref().map(ChannelName::as_str), Some("blaze/reply/me"));
             assert_eq!(refused.id.as_deref(), (member != "id").then_some("7f1c"));
             assert_eq!(refused.error.code, ErrorCode::InvalidRequest);
             assert!(refused.error.detail.starts_with(&format!("{member}: ")), "{refused:?}");

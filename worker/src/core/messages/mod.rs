@@ -8,8 +8,8 @@
 //! blaze:watchdog:…      fields ┴[watchdog]──▶ ServiceState
 //! ```
 //!
-//! What comes in may be anything: it is bounded in bytes and depth, unknown members are ignored, and a fault names the
-//! member but never repeats a value that is not a name.
+//! What comes in may be anything: it is bounded in bytes and depth, unknown members are ignored,
+//! and a fault names the member but never repeats a value that is not a name.
 
 mod ack;
 mod fields;

@@ -45,7 +45,8 @@ pub struct ServiceState {
     pub key: WatchdogKey,
     /// Its layer.
     pub layer: Option<LayerName>,
-    /// Number of its life; of two processes with the same key the one with the higher number counts.
+    /// Number of its life; of two processes with the same key the one with the higher number
+    /// counts.
     pub epoch: u64,
     /// How it is.
     pub health: Health,
@@ -72,16 +73,17 @@ impl ServiceState {
     ///
     /// # Errors
     /// What is wrong, in words that name the field.
-    pub fn of_fields<'f>(fields: impl IntoIterator<Item = (&'f str, &'f str)>) -> Result<Self, String> {
+    pub fn of_fields<'f>(
+        fields: impl IntoIterator<Item = (&'f str, &'f str)>,
+    ) -> Result<Self, String> {
         let members = fields.into_iter().map(|(name, value)| (name.to_owned(), value.into()));
         Self::of_members(&members.collect())
     }
 
     fn of_members(members: &Map<String, Value>) -> Result<Self, String> {
         let word = need(text(members, "state", MAX_WORD_BYTES)?, "state")?;
-        let health = word
-            .parse()
-            .map_err(|_| "state: must be starting, ready, unhealthy or stopping")?;
+        let health =
+            word.parse().map_err(|_| "state: must be starting, ready, unhealthy or stopping")?;
         let number = |name: &str| -> Result<u64, String> { Ok(whole(members, name)?.unwrap_or(0)) };
         // Redis has no null: an empty text is none.
         let layer = match members.get("layer").and_then(Value::as_str) {
@@ -128,8 +130,10 @@ mod tests {
     #[test]
     fn a_hash_and_a_message_say_the_same() {
         let of_hash = ServiceState::of_fields(FIELDS).unwrap();
-        let message = json!({"layer": "edge", "node": "robot-1", "service": "slam", "instance": "0", "epoch": 17,
-            "state": "ready", "since_ms": 1_795_244_472_345_u64, "version": "1.2.3", "config_revision": 431,
+        let message = json!({"layer": "edge", "node": "robot-1", "service": "slam", "instance": "0",
+            "epoch": 17,
+            "state": "ready", "since_ms": 1_795_244_472_345_u64, "version": "1.2.3",
+            "config_revision": 431,
             "config_hash": "sha256:ab", "ttl_ms": 15000});
         assert_eq!(ServiceState::parse(message.to_string().as_bytes()), Ok(of_hash.clone()));
         assert_eq!(

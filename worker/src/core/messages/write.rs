@@ -13,10 +13,11 @@ use crate::core::notice::{Notice, Scope, Standing};
 
 /// How secrets reach a service.
 ///
-/// The configuration that a service reads must be usable as it is: where a text is wanted, a text must stand. So a secret
-/// is delivered as a plain text in place of the whole `{"$secret":…}` object. Where that must not be, or where the
-/// text is not known (a copy that was kept without a key has none), the redacted object stands there instead, as for
-/// a user: it is no text, so that no service takes it for the secret by mistake. The hash is the same in both forms.
+/// The configuration that a service reads must be usable as it is: where a text is wanted, a text
+/// must stand. So a secret is delivered as a plain text in place of the whole `{"$secret":…}`
+/// object. Where that must not be, or where the text is not known (a copy that was kept without a
+/// key has none), the redacted object stands there instead, as for a user: it is no text, so that
+/// no service takes it for the secret by mistake. The hash is the same in both forms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
     /// As text.
@@ -29,7 +30,8 @@ impl Delivery {
     /// The document as it is kept in memory and in copies: without texts where nobody is told them.
     #[must_use]
     pub fn kept(self, document: Arc<Document>) -> Arc<Document> {
-        let has_secrets = secret::contains(&document.spec) || document.status.as_ref().is_some_and(secret::contains);
+        let has_secrets = secret::contains(&document.spec)
+            || document.status.as_ref().is_some_and(secret::contains);
         if self == Self::Text || !has_secrets {
             return document;
         }
@@ -55,10 +57,11 @@ impl Delivery {
         secret::map(&mut out, &mut |_, value| {
             let known = Secret::of(value).and_then(Result::ok);
             let text = match (self, known) {
-                (Self::Text, Some(Secret::Text(text) | Secret::Revealed { text, .. })) => Some(text),
-                (Self::Text, Some(Secret::Redacted { .. } | Secret::Stored { .. }) | None) | (Self::Redacted, _) => {
-                    None
+                (Self::Text, Some(Secret::Text(text) | Secret::Revealed { text, .. })) => {
+                    Some(text)
                 }
+                (Self::Text, Some(Secret::Redacted { .. } | Secret::Stored { .. }) | None)
+                | (Self::Redacted, _) => None,
             };
             Some(text.map_or_else(|| secret::redact(value).into_owned(), Value::from))
         });
@@ -98,10 +101,7 @@ pub fn reply(reply: &Reply, id: Option<&str>, delivery: Delivery, freshness: Fre
 /// The refusal of a request with an id.
 #[must_use]
 pub fn refusal(error: &RequestError, id: Option<&str>) -> String {
-    with_id(
-        id,
-        json!({ "error": { "code": error.code.as_str(), "detail": error.detail } }),
-    )
+    with_id(id, json!({ "error": { "code": error.code.as_str(), "detail": error.detail } }))
 }
 
 /// Members behind the id, if there is one.
@@ -118,11 +118,19 @@ fn with_id(id: Option<&str>, members: Value) -> String {
 ///
 /// # Errors
 /// The configuration is too large.
-pub fn state_value(standing: &Standing, delivery: Delivery, freshness: Freshness) -> Result<String, TooLargeMessage> {
+pub fn state_value(
+    standing: &Standing,
+    delivery: Delivery,
+    freshness: Freshness,
+) -> Result<String, TooLargeMessage> {
     members(standing, delivery, freshness).map(|members| members.to_string())
 }
 
-fn members(standing: &Standing, delivery: Delivery, freshness: Freshness) -> Result<Value, TooLargeMessage> {
+fn members(
+    standing: &Standing,
+    delivery: Delivery,
+    freshness: Freshness,
+) -> Result<Value, TooLargeMessage> {
     let at = &standing.at;
     let mut out = json!({
         "service": at.service, "instance": at.instance, "layer": at.layer, "node": at.node,
@@ -139,12 +147,17 @@ fn members(standing: &Standing, delivery: Delivery, freshness: Freshness) -> Res
 ///
 /// # Errors
 /// The configuration is too large.
-pub fn notice(notice: &Notice, delivery: Delivery, time: Timestamp) -> Result<String, TooLargeMessage> {
+pub fn notice(
+    notice: &Notice,
+    delivery: Delivery,
+    time: Timestamp,
+) -> Result<String, TooLargeMessage> {
     let scopes = notice.scopes.iter().copied().map(Scope::as_str);
     let mut out = json!({
         "service": notice.place.service, "instance": notice.place.instance, "layer": notice.layer,
         "node": notice.place.node, "revision": notice.revision, "hash": notice.hash,
-        "previous_hash": notice.previous_hash, "paths": notice.paths, "scopes": scopes.collect::<Vec<_>>(),
+        "previous_hash": notice.previous_hash, "paths": notice.paths,
+        "scopes": scopes.collect::<Vec<_>>(),
         "config": null, "deleted": true, "source": notice.source.as_str(), "time": time.to_string(),
     });
     if let (Value::Object(members), Some(config)) = (&mut out, &notice.config) {
@@ -159,7 +172,8 @@ impl Freshness {
         self.as_of.map(|time| time.to_string())
     }
 
-    /// Seconds since the worker last knew itself in sync, to a tenth; a clock that was set back does not make it negative.
+    /// Seconds since the worker last knew itself in sync, to a tenth; a clock that was set back
+    /// does not make it negative.
     #[must_use]
     pub fn age_s(&self) -> Option<f64> {
         let ms = self.now.as_millis() - self.as_of?.as_millis();

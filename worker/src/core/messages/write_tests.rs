@@ -64,19 +64,10 @@ fn an_answer_has_the_members_of_the_contract_in_their_order() {
         r#""service":"slam","instance":"0","layer":"edge","node":"robot-1","revision":431,"hash":"{hash}","config":{{"a":1}},"source":"main","as_of":"2026-11-21T07:01:12.345Z","age_s":3.1,"rollout":null}}"#
     );
     assert_eq!(full, format!(r#"{{"id":"7f1c",{state}"#));
-    assert_eq!(
-        state_value(&standing, Delivery::Text, freshness()).unwrap(),
-        format!("{{{state}")
-    );
-    let unchanged = Reply::Unchanged {
-        revision: 431,
-        hash: "sha256:ab".to_owned(),
-        source: Source::File,
-    };
-    let never = Freshness {
-        as_of: None,
-        ..freshness()
-    };
+    assert_eq!(state_value(&standing, Delivery::Text, freshness()).unwrap(), format!("{{{state}"));
+    let unchanged =
+        Reply::Unchanged { revision: 431, hash: "sha256:ab".to_owned(), source: Source::File };
+    let never = Freshness { as_of: None, ..freshness() };
     assert_eq!(
         reply(&unchanged, None, Delivery::Text, never),
         r#"{"unchanged":true,"revision":431,"hash":"sha256:ab","source":"file","as_of":null,"age_s":null}"#
@@ -114,11 +105,7 @@ fn a_secret_is_a_plain_text_or_redacted() {
         (json!("canary"), json!("canary"), 0),
         // What is not known is not made up.
         (json!({"redacted": true, "version": 7}), Value::Null, 7),
-        (
-            json!({"key": "e1", "nonce": "canary", "data": "canary", "version": 7}),
-            Value::Null,
-            7,
-        ),
+        (json!({"key": "e1", "nonce": "canary", "data": "canary", "version": 7}), Value::Null, 7),
         (json!(["canary"]), Value::Null, 0),
     ] {
         let config = json!({"db": [{"pw": {"$secret": stored}}], "n": 1});
@@ -141,12 +128,8 @@ fn what_is_too_large_is_refused() {
         assert_eq!(state_value(&standing, Delivery::Text, freshness()).is_ok(), fits);
         let time = Timestamp::from_millis(NOW);
         assert_eq!(notice(&a_notice(Some(&config)), Delivery::Text, time).is_ok(), fits);
-        let answer = reply(
-            &Reply::Standing(Box::new(standing)),
-            Some("7f1c"),
-            Delivery::Text,
-            freshness(),
-        );
+        let answer =
+            reply(&Reply::Standing(Box::new(standing)), Some("7f1c"), Delivery::Text, freshness());
         assert_eq!(
             answer.starts_with(r#"{"id":"7f1c","error":{"code":"too_large","detail":"#),
             !fits
@@ -156,14 +139,9 @@ fn what_is_too_large_is_refused() {
 
 #[test]
 fn an_age_has_one_decimal_and_is_never_negative() {
-    for (ms, text) in [
-        (0, "0.0"),
-        (49, "0.0"),
-        (50, "0.1"),
-        (3100, "3.1"),
-        (61_000, "61.0"),
-        (-5000, "0.0"),
-    ] {
+    for (ms, text) in
+        [(0, "0.0"), (49, "0.0"), (50, "0.1"), (3100, "3.1"), (61_000, "61.0"), (-5000, "0.0")]
+    {
         let freshness = Freshness {
             as_of: Some(Timestamp::from_millis(NOW)),
             now: Timestamp::from_millis(NOW + ms),

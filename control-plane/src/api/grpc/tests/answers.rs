@@ -1,4 +1,5 @@
-//! Answers of the methods are those of REST, and no text of a secret is in any that was not asked for it.
+//! Answers of the methods are those of REST, and no text of a secret is in any that was not asked
+//! for it.
 
 use std::fmt::Debug;
 
@@ -15,9 +16,7 @@ fn clean(what: &str, said: &str) {
 
 /// The message of an answer, without a secret.
 fn shown<T: Debug>(what: &str, answer: Result<tonic::Response<T>, tonic::Status>) -> T {
-    let message = answer
-        .unwrap_or_else(|status| panic!("{what}: {status:?}"))
-        .into_inner();
+    let message = answer.unwrap_or_else(|status| panic!("{what}: {status:?}")).into_inner();
     clean(what, &format!("{message:?}"));
     message
 }
@@ -50,10 +49,7 @@ fn item(r#ref: Option<v1::Ref>, spec: &Value) -> v1::ApplyItem {
         labels: [("canary".to_owned(), "true".to_owned())].into(),
         ..Default::default()
     };
-    v1::ApplyItem {
-        document: Some(document),
-        delete: false,
-    }
+    v1::ApplyItem { document: Some(document), delete: false }
 }
 
 /// A service with a secret and one instance, in revision 1.
@@ -79,10 +75,7 @@ async fn world() -> Fixture {
 async fn get(fixture: &Fixture, reveal: bool) -> v1::Document {
     let request = v1::GetRequest {
         r#ref: service(),
-        read: Some(v1::ReadOptions {
-            reveal,
-            ..Default::default()
-        }),
+        read: Some(v1::ReadOptions { reveal, ..Default::default() }),
     };
     fixture.client().get(request).await.unwrap().into_inner()
 }
@@ -100,20 +93,10 @@ async fn what_shows_the_system_says_the_same_as_rest() {
     let revoke = v1::RevokeTokenRequest { id: token.id.clone() };
     shown("RevokeToken", client.revoke_token(revoke).await);
 
-    let place = v1::Place {
-        service: "slam".into(),
-        instance: "0".into(),
-        ..Default::default()
-    };
-    let effective = v1::GetEffectiveRequest {
-        place: Some(place),
-        explain: true,
-        read: None,
-    };
+    let place = v1::Place { service: "slam".into(), instance: "0".into(), ..Default::default() };
+    let effective = v1::GetEffectiveRequest { place: Some(place), explain: true, read: None };
     let effective = shown("GetEffective", client.get_effective(effective).await);
-    let rest = fixture
-        .rest("/api/v1/effective?service=slam&instance=0&explain=true")
-        .await;
+    let rest = fixture.rest("/api/v1/effective?service=slam&instance=0&explain=true").await;
     assert_eq!(parsed(&effective.config_json), rest["config"]);
     assert_eq!(parsed(&effective.explain_json), rest["explain"]);
     assert_eq!(
@@ -129,10 +112,7 @@ async fn what_shows_the_system_says_the_same_as_rest() {
     ] {
         assert_eq!(name, rest[member].as_str().unwrap_or_default(), "{member}");
     }
-    assert!(
-        effective.config_json.contains("redacted"),
-        "the secret is part of what is shown"
-    );
+    assert!(effective.config_json.contains("redacted"), "the secret is part of what is shown");
 
     let digest = v1::GetDigestRequest { layer: "edge".into() };
     let digest = shown("GetDigest", client.get_digest(digest).await).json;
@@ -150,10 +130,7 @@ async fn what_shows_the_system_says_the_same_as_rest() {
         assert_eq!(parsed(&said), fixture.rest(&format!("/api/v1/{path}")).await, "{path}");
         assert!(said.contains(holds), "{path}: {said}");
     }
-    assert!(
-        parsed(&tokens)["items"][0]["revoke_time"].is_string(),
-        "it was revoked: {tokens}"
-    );
+    assert!(parsed(&tokens)["items"][0]["revoke_time"].is_string(), "it was revoked: {tokens}");
 }
 
 #[tokio::test]
@@ -167,11 +144,7 @@ async fn what_changes_the_past_and_ends_roll_outs_does_it() {
         precondition: exactly(1),
     };
     shown("Patch", client.patch(patch).await);
-    let rollback = v1::RollbackRequest {
-        r#ref: service(),
-        revision: 1,
-        ..Default::default()
-    };
+    let rollback = v1::RollbackRequest { r#ref: service(), revision: 1, ..Default::default() };
     let back = shown("Rollback", client.rollback(rollback).await);
     assert_eq!((back.revision, n().await), (3, json!(1)));
     same(&back, &fixture.rest("/api/v1/services/slam").await);
@@ -182,13 +155,15 @@ async fn what_changes_the_past_and_ends_roll_outs_does_it() {
         reason: reason.into(),
     };
     let mut promoted = 0;
-    for (name, action, reason, phase, tried) in [
-        ("good", "promote", "", "promoted", 3),
-        ("bad", "abort", "enough of it", "aborted", 4),
-    ] {
+    for (name, action, reason, phase, tried) in
+        [("good", "promote", "", "promoted", 3), ("bad", "abort", "enough of it", "aborted", 4)]
+    {
         let spec = json!({
             "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "n": tried } },
-            "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+            "canary": { "node_selector": "canary=true" }, "gate": {
+                "window_s": 60,
+                "max_unhealthy": 0,
+            },
         });
         let create = v1::CreateRequest {
             document: item(reference(v1::Kind::Rollout, name), &spec).document,
@@ -213,10 +188,7 @@ async fn what_changes_the_past_and_ends_roll_outs_does_it() {
             "{name}"
         );
     }
-    let revert = v1::RevertRequest {
-        revision: promoted,
-        force: false,
-    };
+    let revert = v1::RevertRequest { revision: promoted, force: false };
     let report = shown("Revert", client.revert(revert).await);
     let ops: Vec<_> = report.results.iter().map(v1::ApplyResult::op).collect();
     assert!(ops.contains(&v1::Op::Update), "{report:?}");
@@ -231,11 +203,7 @@ async fn a_secret_is_told_to_nobody_who_does_not_ask_for_it() {
     let mut client = fixture.client();
     let secret = |number: u32| json!({ "$secret": format!("{CANARY}-{number}") });
     let document = |spec_json: String| {
-        Some(v1::Document {
-            r#ref: service(),
-            spec_json,
-            ..Default::default()
-        })
+        Some(v1::Document { r#ref: service(), spec_json, ..Default::default() })
     };
     let replace = v1::ReplaceRequest {
         document: document(json!({ "config": { "password": secret(2) } }).to_string()),
@@ -245,36 +213,17 @@ async fn a_secret_is_told_to_nobody_who_does_not_ask_for_it() {
     let patch = |merge_patch_json: String| v1::PatchRequest {
         r#ref: service(),
         merge_patch_json,
-        precondition: Some(v1::Precondition {
-            is: Some(v1::precondition::Is::Any(true)),
-        }),
+        precondition: Some(v1::Precondition { is: Some(v1::precondition::Is::Any(true)) }),
     };
     let merge = json!({ "spec": { "config": { "list": [secret(3)] } } }).to_string();
     said.push(format!("{:?}", shown("Patch", client.patch(patch(merge)).await)));
-    let list = v1::ListRequest {
-        kind: v1::Kind::Service.into(),
-        ..Default::default()
-    };
+    let list = v1::ListRequest { kind: v1::Kind::Service.into(), ..Default::default() };
     said.push(format!("{:?}", shown("List", client.list(list).await)));
-    let history = v1::ListHistoryRequest {
-        r#ref: service(),
-        full: true,
-        ..Default::default()
-    };
-    said.push(format!(
-        "{:?}",
-        shown("ListHistory", client.list_history(history).await)
-    ));
-    let diff = v1::DiffRequest {
-        r#ref: service(),
-        from_revision: 1,
-        to_revision: 3,
-    };
+    let history = v1::ListHistoryRequest { r#ref: service(), full: true, ..Default::default() };
+    said.push(format!("{:?}", shown("ListHistory", client.list_history(history).await)));
+    let diff = v1::DiffRequest { r#ref: service(), from_revision: 1, to_revision: 3 };
     said.push(format!("{:?}", shown("Diff", client.diff(diff).await)));
-    let watch = v1::WatchRequest {
-        since: Some(0),
-        ..Default::default()
-    };
+    let watch = v1::WatchRequest { since: Some(0), ..Default::default() };
     let mut stream = client.watch(watch).await.unwrap().into_inner();
     let mut told = 0;
     while told < 3 {
@@ -290,11 +239,9 @@ async fn a_secret_is_told_to_nobody_who_does_not_ask_for_it() {
 
     // What ends too soon is not quoted where that is said.
     let cut = format!(r#"{{"spec":{{"config":{{"password":{{"$secret":"{CANARY}-4"#);
-    let create = v1::CreateRequest {
-        document: document(cut.clone()),
-        request_id: String::new(),
-    };
-    let wrong = json!({ "spec": { "config": { "a": { "$secret": format!("{CANARY}-5"), "b": 1 } } } });
+    let create = v1::CreateRequest { document: document(cut.clone()), request_id: String::new() };
+    let wrong =
+        json!({ "spec": { "config": { "a": { "$secret": format!("{CANARY}-5"), "b": 1 } } } });
     for refused in [
         client.create(create).await.unwrap_err(),
         client.patch(patch(cut)).await.unwrap_err(),

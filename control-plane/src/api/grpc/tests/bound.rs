@@ -1,5 +1,5 @@
-//! A token that is bound to one layer: every method that can name something of another one refuses, existing or not, and the
-//! others leave it out.
+//! A token that is bound to one layer: every method that can name something of another one refuses,
+//! existing or not, and the others leave it out.
 
 use std::collections::BTreeSet;
 
@@ -42,71 +42,35 @@ fn on(name: &str, layer: &str) -> Option<v1::Document> {
 }
 
 fn apply(documents: impl IntoIterator<Item = Option<v1::Document>>) -> v1::ApplyRequest {
-    let item = |document| v1::ApplyItem {
-        document,
-        delete: false,
-    };
-    v1::ApplyRequest {
-        items: documents.into_iter().map(item).collect(),
-        ..Default::default()
-    }
+    let item = |document| v1::ApplyItem { document, delete: false };
+    v1::ApplyRequest { items: documents.into_iter().map(item).collect(), ..Default::default() }
 }
 
 fn get(name: &str) -> v1::GetRequest {
-    v1::GetRequest {
-        r#ref: node(name),
-        read: None,
-    }
+    v1::GetRequest { r#ref: node(name), read: None }
 }
 
 fn effective(node: &str, layer: &str) -> v1::GetEffectiveRequest {
     v1::GetEffectiveRequest {
-        place: Some(v1::Place {
-            node: node.into(),
-            layer: layer.into(),
-            ..Default::default()
-        }),
+        place: Some(v1::Place { node: node.into(), layer: layer.into(), ..Default::default() }),
         ..Default::default()
     }
 }
 
 /// What touches the other layer, or all of them. Everything that is there was made in revision 1.
 fn outside() -> Vec<(&'static str, Vec<u8>)> {
-    let any = Some(v1::Precondition {
-        is: Some(v1::precondition::Is::Any(true)),
-    });
-    let replace = |document| v1::ReplaceRequest {
-        document,
-        precondition: any,
-    };
-    let create = v1::CreateRequest {
-        document: on("f2", "fog"),
-        ..Default::default()
-    };
+    let any = Some(v1::Precondition { is: Some(v1::precondition::Is::Any(true)) });
+    let replace = |document| v1::ReplaceRequest { document, precondition: any };
+    let create = v1::CreateRequest { document: on("f2", "fog"), ..Default::default() };
     let patch = v1::PatchRequest {
         r#ref: node("f1"),
         merge_patch_json: r#"{"labels":{"a":"b"}}"#.into(),
         precondition: any,
     };
-    let delete = v1::DeleteRequest {
-        r#ref: node("f1"),
-        precondition: any,
-        cascade: false,
-    };
-    let history = v1::ListHistoryRequest {
-        r#ref: node("f1"),
-        ..Default::default()
-    };
-    let diff = v1::DiffRequest {
-        r#ref: node("f1"),
-        from_revision: 1,
-        to_revision: 1,
-    };
-    let rollback = v1::RollbackRequest {
-        r#ref: node("f1"),
-        revision: 1,
-        ..Default::default()
-    };
+    let delete = v1::DeleteRequest { r#ref: node("f1"), precondition: any, cascade: false };
+    let history = v1::ListHistoryRequest { r#ref: node("f1"), ..Default::default() };
+    let diff = v1::DiffRequest { r#ref: node("f1"), from_revision: 1, to_revision: 1 };
+    let rollback = v1::RollbackRequest { r#ref: node("f1"), revision: 1, ..Default::default() };
     let watch = v1::WatchRequest {
         since: Some(0),
         layer: "fog".into(),
@@ -124,10 +88,7 @@ fn outside() -> Vec<(&'static str, Vec<u8>)> {
         roles: vec!["admin".into()],
         ..Default::default()
     };
-    let revert = v1::RevertRequest {
-        revision: 1,
-        force: true,
-    };
+    let revert = v1::RevertRequest { revision: 1, force: true };
     vec![
         ("Get", get("f1").encode_to_vec()),
         ("Get", get("absent").encode_to_vec()),
@@ -146,15 +107,9 @@ fn outside() -> Vec<(&'static str, Vec<u8>)> {
         ("SetRollout", rollout.encode_to_vec()),
         ("ListAudit", v1::ListAuditRequest::default().encode_to_vec()),
         ("CreateToken", token.encode_to_vec()),
-        (
-            "RevokeToken",
-            v1::RevokeTokenRequest { id: "absent".into() }.encode_to_vec(),
-        ),
+        ("RevokeToken", v1::RevokeTokenRequest { id: "absent".into() }.encode_to_vec()),
         ("ListTokens", v1::ListTokensRequest {}.encode_to_vec()),
-        (
-            "GetDigest",
-            v1::GetDigestRequest { layer: "fog".into() }.encode_to_vec(),
-        ),
+        ("GetDigest", v1::GetDigestRequest { layer: "fog".into() }.encode_to_vec()),
         ("Trim", v1::TrimRequest { before: 1 }.encode_to_vec()),
         ("Revert", revert.encode_to_vec()),
     ]
@@ -192,18 +147,13 @@ async fn a_token_of_one_layer_is_refused_by_every_method_to_another() {
         assert_eq!(posted.headers["blaze-revision"], "1", "{method} wrote nothing");
     }
 
-    let list = v1::ListRequest {
-        kind: v1::Kind::Node.into(),
-        ..Default::default()
-    };
+    let list = v1::ListRequest { kind: v1::Kind::Node.into(), ..Default::default() };
     for (asking, seen) in [(&bound, &["e1"][..]), (&all, &["e1", "f1"])] {
         let listed: v1::ListResponse = asking.answer("List", &list).await;
-        let names = listed
-            .items
-            .iter()
-            .map(|item| item.r#ref.as_ref().unwrap().name.as_str());
+        let names = listed.items.iter().map(|item| item.r#ref.as_ref().unwrap().name.as_str());
         assert_eq!(names.collect::<Vec<_>>(), seen);
-        let topology: v1::JsonResponse = asking.answer("GetTopology", &v1::GetTopologyRequest {}).await;
+        let topology: v1::JsonResponse =
+            asking.answer("GetTopology", &v1::GetTopologyRequest {}).await;
         for name in ["e1", "f1"] {
             let is_there = topology.json.contains(&format!("\"{name}\""));
             assert_eq!(is_there, seen.contains(&name), "{name}: {}", topology.json);

@@ -104,7 +104,10 @@ impl Fixture {
     }
 
     pub(super) fn client(&self) -> ConfigServiceClient<Router> {
-        ConfigServiceClient::with_origin(self.router.clone(), "http://localhost:50051".parse().unwrap())
+        ConfigServiceClient::with_origin(
+            self.router.clone(),
+            "http://localhost:50051".parse().unwrap(),
+        )
     }
 
     /// A token that runs out after some seconds, or did so before.
@@ -130,9 +133,8 @@ impl Fixture {
     /// What REST answers, in development.
     pub(super) async fn rest(&self, path: &str) -> Value {
         let peer: SocketAddr = "127.0.0.1:40000".parse().unwrap();
-        let request = HttpRequest::get(path)
-            .header("host", "localhost:8080")
-            .extension(ConnectInfo(peer));
+        let request =
+            HttpRequest::get(path).header("host", "localhost:8080").extension(ConnectInfo(peer));
         let response = self.rest.clone().oneshot(request.body(Body::empty()).unwrap());
         let (parts, body) = response.await.unwrap().into_parts();
         let body = body.collect().await.unwrap().to_bytes();
@@ -141,30 +143,33 @@ impl Fixture {
     }
 
     /// Sends one message by hand.
-    pub(super) async fn post(&self, path: &str, headers: &[(&str, &str)], message: &[u8]) -> Posted {
+    pub(super) async fn post(
+        &self,
+        path: &str,
+        headers: &[(&str, &str)],
+        message: &[u8],
+    ) -> Posted {
         self.post_frame(path, headers, frame(message)).await
     }
 
-    pub(super) async fn post_frame(&self, path: &str, headers: &[(&str, &str)], frame: Bytes) -> Posted {
-        let mut request =
-            HttpRequest::post(format!("http://localhost{path}")).header("content-type", "application/grpc");
+    pub(super) async fn post_frame(
+        &self,
+        path: &str,
+        headers: &[(&str, &str)],
+        frame: Bytes,
+    ) -> Posted {
+        let mut request = HttpRequest::post(format!("http://localhost{path}"))
+            .header("content-type", "application/grpc");
         for (name, value) in headers {
             request = request.header(*name, *value);
         }
-        let response = self
-            .router
-            .clone()
-            .oneshot(request.body(Body::from(frame)).unwrap())
-            .await
-            .unwrap();
+        let response =
+            self.router.clone().oneshot(request.body(Body::from(frame)).unwrap()).await.unwrap();
         let headers = response.headers().clone();
         let body = response.into_body().collect().await.unwrap();
-        let status = Status::from_header_map(&headers).or_else(|| Status::from_header_map(body.trailers()?));
-        Posted {
-            status: status.unwrap(),
-            headers,
-            body: body.to_bytes(),
-        }
+        let status =
+            Status::from_header_map(&headers).or_else(|| Status::from_header_map(body.trailers()?));
+        Posted { status: status.unwrap(), headers, body: body.to_bytes() }
     }
 }
 
@@ -191,11 +196,7 @@ pub(super) fn code(status: &Status) -> Code {
 }
 
 pub(super) fn reference(kind: v1::Kind, name: &str) -> Option<v1::Ref> {
-    Some(v1::Ref {
-        kind: kind.into(),
-        name: name.into(),
-        service: String::new(),
-    })
+    Some(v1::Ref { kind: kind.into(), name: name.into(), service: String::new() })
 }
 
 pub(super) fn layer(name: &str, spec: &str) -> Option<v1::Document> {
@@ -207,14 +208,9 @@ pub(super) fn layer(name: &str, spec: &str) -> Option<v1::Document> {
 }
 
 pub(super) fn create(name: &str, request_id: &str) -> v1::CreateRequest {
-    v1::CreateRequest {
-        document: layer(name, r#"{"kind":"edge"}"#),
-        request_id: request_id.into(),
-    }
+    v1::CreateRequest { document: layer(name, r#"{"kind":"edge"}"#), request_id: request_id.into() }
 }
 
 pub(super) fn exactly(revision: u64) -> Option<v1::Precondition> {
-    Some(v1::Precondition {
-        is: Some(v1::precondition::Is::Revision(revision)),
-    })
+    Some(v1::Precondition { is: Some(v1::precondition::Is::Revision(revision)) })
 }

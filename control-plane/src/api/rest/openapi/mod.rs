@@ -5,8 +5,8 @@
 //! parts.yaml ┴─▶ 3.1.0 ──[twin]──▶ 3.0.3, for tools that do not read 3.1
 //! ```
 //!
-//! Both are committed in `openapi/`; a test compares them, and another one, which is asked for by name, writes them anew:
-//! `cargo test -p blaze-config --lib write_openapi -- --ignored`.
+//! Both are committed in `openapi/`; a test compares them, and another one, which is asked for by
+//! name, writes them anew: `cargo test -p blaze-config --lib write_openapi -- --ignored`.
 
 #[cfg(test)]
 mod tests;
@@ -178,9 +178,7 @@ fn reference(group: &str, name: &str) -> Value {
 fn headers<'a>(names: impl IntoIterator<Item = &'a str>) -> Value {
     let mut names: Vec<&str> = names.into_iter().collect();
     names.sort_unstable();
-    let headers = names
-        .into_iter()
-        .map(|name| (name.to_owned(), reference("headers", name)));
+    let headers = names.into_iter().map(|name| (name.to_owned(), reference("headers", name)));
     Value::Object(headers.collect())
 }
 
@@ -195,9 +193,7 @@ fn refusals() -> Value {
     statuses.dedup();
     // A path of this document takes the method of its operation.
     statuses.retain(|status| *status != 405);
-    let refusals = statuses
-        .into_iter()
-        .map(|status| (refusal_name(status), refusal(status)));
+    let refusals = statuses.into_iter().map(|status| (refusal_name(status), refusal(status)));
     Value::Object(refusals.collect())
 }
 

@@ -18,10 +18,7 @@ fn committed(name: &str) -> PathBuf {
 }
 
 fn both() -> [(&'static str, String); 2] {
-    [
-        ("openapi.json", openapi_json()),
-        ("openapi-3.0.json", openapi_3_0_json()),
-    ]
+    [("openapi.json", openapi_json()), ("openapi-3.0.json", openapi_3_0_json())]
 }
 
 #[test]
@@ -30,7 +27,8 @@ fn the_committed_documents_are_those_of_the_code() {
         let found = std::fs::read_to_string(committed(name)).unwrap_or_default();
         assert!(
             found == text,
-            "openapi/{name} is not what the code says: cargo test -p blaze-config --lib write_openapi -- --ignored"
+            "openapi/{name} is not what the code says: cargo test -p blaze-config --lib \
+             write_openapi -- --ignored"
         );
     }
 }
@@ -78,14 +76,12 @@ fn each_operation_is_complete() {
             in_path,
             "{name}"
         );
-        assert_eq!(
-            operation.get("requestBody").is_some(),
-            responses.contains_key("415"),
-            "{name}"
-        );
+        assert_eq!(operation.get("requestBody").is_some(), responses.contains_key("415"), "{name}");
         assert_eq!(
             responses.contains_key("428"),
-            method == "put" || method == "patch" || (method == "delete" && !path.contains("tokens")),
+            method == "put"
+                || method == "patch"
+                || (method == "delete" && !path.contains("tokens")),
             "{name}"
         );
         if responses.contains_key("428") {
@@ -118,30 +114,12 @@ fn words_and_limits_are_those_of_the_code() {
         ("LayerSpec/properties/kind/enum", json!(layers)),
         ("NodeSpec/properties/type/enum", json!(nodes)),
         ("NodeSpec/properties/addresses/maxItems", json!(spec::MAX_ADDRESSES)),
-        (
-            "NodeSpec/properties/resources/properties/gpus/maximum",
-            json!(spec::MAX_RESOURCE_UNITS),
-        ),
-        (
-            "NodeSpec/properties/resources/properties/cpus/maximum",
-            json!(spec::MAX_RESOURCE_UNITS),
-        ),
-        (
-            "ServiceSpec/properties/description/maxLength",
-            json!(spec::MAX_DESCRIPTION_CHARS),
-        ),
-        (
-            "ServiceSpec/properties/layers/maxItems",
-            json!(spec::MAX_SERVICE_LAYERS),
-        ),
-        (
-            "RolloutSpec/properties/gate/properties/window_s/minimum",
-            json!(shortest),
-        ),
-        (
-            "RolloutSpec/properties/gate/properties/window_s/maximum",
-            json!(longest),
-        ),
+        ("NodeSpec/properties/resources/properties/gpus/maximum", json!(spec::MAX_RESOURCE_UNITS)),
+        ("NodeSpec/properties/resources/properties/cpus/maximum", json!(spec::MAX_RESOURCE_UNITS)),
+        ("ServiceSpec/properties/description/maxLength", json!(spec::MAX_DESCRIPTION_CHARS)),
+        ("ServiceSpec/properties/layers/maxItems", json!(spec::MAX_SERVICE_LAYERS)),
+        ("RolloutSpec/properties/gate/properties/window_s/minimum", json!(shortest)),
+        ("RolloutSpec/properties/gate/properties/window_s/maximum", json!(longest)),
         (
             "RolloutSpec/properties/gate/properties/max_unhealthy/maximum",
             json!(spec::MAX_UNHEALTHY),
@@ -152,10 +130,7 @@ fn words_and_limits_are_those_of_the_code() {
         ),
         ("Labels/maxProperties", json!(MAX_LABELS)),
         ("Labels/additionalProperties/maxLength", json!(MAX_LABEL_BYTES)),
-        (
-            "Annotations/propertyNames/maxLength",
-            json!(spec::MAX_ANNOTATION_KEY_CHARS),
-        ),
+        ("Annotations/propertyNames/maxLength", json!(spec::MAX_ANNOTATION_KEY_CHARS)),
         ("AbortRequest/properties/reason/maxLength", json!(MAX_REASON)),
         ("TokenRequest/properties/roles/items/enum", json!(roles)),
         ("TokenRequest/properties/expires_in_s/maximum", json!(MAX_LIFE_S)),
@@ -207,10 +182,7 @@ fn every_reference_leads_somewhere_and_every_component_is_used() {
 #[test]
 fn the_twin_has_nothing_of_3_1() {
     fn look(value: &Value, path: &str) {
-        if ["/example", "/examples", "/default", "/enum"]
-            .iter()
-            .any(|end| path.ends_with(end))
-        {
+        if ["/example", "/examples", "/default", "/enum"].iter().any(|end| path.ends_with(end)) {
             return;
         }
         match value {
@@ -224,7 +196,8 @@ fn the_twin_has_nothing_of_3_1() {
             Value::Object(members) => {
                 for (name, member) in members {
                     let of_schema = !path.ends_with("/properties");
-                    let newer = ["const", "propertyNames", "examples", "$schema", "webhooks"].contains(&name.as_str());
+                    let newer = ["const", "propertyNames", "examples", "$schema", "webhooks"]
+                        .contains(&name.as_str());
                     assert!(!(newer && of_schema), "{path}/{name}");
                     let bound = ["exclusiveMinimum", "exclusiveMaximum"].contains(&name.as_str());
                     assert!(!(bound && member.is_number()), "{path}");
@@ -243,9 +216,7 @@ fn the_twin_has_nothing_of_3_1() {
     assert_eq!(twin["openapi"], "3.0.3");
     look(&twin, "");
     for (path, method, operation) in operations(&twin) {
-        let types = operation["requestBody"]["content"]
-            .as_object()
-            .map_or(0, serde_json::Map::len);
+        let types = operation["requestBody"]["content"].as_object().map_or(0, serde_json::Map::len);
         assert!(types <= 1, "{method} {path}");
         let schemas: BTreeSet<String> = operation["responses"]
             .as_object()
@@ -263,15 +234,14 @@ fn examples_are_what_the_schemas_take() {
     let document = document();
     let mut looked_at = 0;
     for (path, method, operation) in operations(&document) {
-        let Some(content) = operation["requestBody"]["content"]["application/json"].as_object() else {
+        let Some(content) = operation["requestBody"]["content"]["application/json"].as_object()
+        else {
             continue;
         };
         let schema = json!({ "components": document["components"], "allOf": [content["schema"]] });
         let validator = jsonschema::draft202012::new(&schema).unwrap();
-        let faults: Vec<String> = validator
-            .iter_errors(&content["example"])
-            .map(|fault| fault.to_string())
-            .collect();
+        let faults: Vec<String> =
+            validator.iter_errors(&content["example"]).map(|fault| fault.to_string()).collect();
         assert!(faults.is_empty(), "{method} {path}: {faults:?}");
         looked_at += 1;
     }

@@ -1,8 +1,9 @@
-//! From OpenAPI 3.1 to 3.0.3: the same paths and answers for tools that read no 3.1. Of 3.1 it knows what the document
-//! uses; a test fails when that is more.
+//! From OpenAPI 3.1 to 3.0.3: the same paths and answers for tools that read no 3.1. Of 3.1 it
+//! knows what the document uses; a test fails when that is more.
 //!
 //! - `type: [T, "null"]` and `oneOf: [X, null]` become `nullable`
-//! - a numeric `exclusiveMinimum` becomes a `minimum` with a flag, `examples` of a schema its first as `example`
+//! - a numeric `exclusiveMinimum` becomes a `minimum` with a flag, `examples` of a schema its first
+//!   as `example`
 //! - `propertyNames` and the license's `identifier` have no place
 //! - of several types of a body `application/json` stays: generators of 3.0 know no others
 //! - `additionalProperties: false` goes: clients made from it must take members that come later
@@ -75,8 +76,10 @@ fn schema(shape: &Value) -> Value {
             }
             ("oneOf", Value::Array(parts)) => {
                 let is_null = |part: &&Value| part.get("type").is_some_and(|found| found == "null");
-                let others: Vec<Value> = parts.iter().filter(|part| !is_null(part)).map(schema).collect();
-                // Beside a reference nothing else counts in 3.0, so that one that may be null is wrapped.
+                let others: Vec<Value> =
+                    parts.iter().filter(|part| !is_null(part)).map(schema).collect();
+                // Beside a reference nothing else counts in 3.0, so that one that may be null is
+                // wrapped.
                 let name = match others.len() == parts.len() {
                     true => "oneOf",
                     false => {

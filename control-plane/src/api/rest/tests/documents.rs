@@ -6,10 +6,7 @@ use super::*;
 async fn a_document_lives() {
     let api = open().await;
     let made = api.send("POST", "/api/v1/layers", &layer()).await;
-    assert_eq!(
-        (made.status.as_u16(), made.header("location")),
-        (201, "/api/v1/layers/edge")
-    );
+    assert_eq!((made.status.as_u16(), made.header("location")), (201, "/api/v1/layers/edge"));
     let tag = made.header("etag").to_owned();
     assert_eq!(tag, format!("\"{}\"", made.header("blaze-revision")));
     assert_eq!(
@@ -19,28 +16,21 @@ async fn a_document_lives() {
 
     let read = api.get("/api/v1/layers/edge").await;
     assert_eq!((read.status.as_u16(), read.header("etag")), (200, tag.as_str()));
-    let unchanged = api
-        .call("GET", "/api/v1/layers/edge", &[("if-none-match", &tag)], "")
-        .await;
+    let unchanged = api.call("GET", "/api/v1/layers/edge", &[("if-none-match", &tag)], "").await;
     assert_eq!(
-        (
-            unchanged.status.as_u16(),
-            unchanged.body.len(),
-            unchanged.header("etag")
-        ),
+        (unchanged.status.as_u16(), unchanged.body.len(), unchanged.header("etag")),
         (304, 0, tag.as_str())
     );
     let weak = format!("W/{tag}");
     assert_eq!(
-        api.call("GET", "/api/v1/layers/edge", &[("if-none-match", &weak)], "")
-            .await
-            .status,
+        api.call("GET", "/api/v1/layers/edge", &[("if-none-match", &weak)], "").await.status,
         200
     );
 
     let other = json!({ "labels": { "site": "lab" }, "spec": { "kind": "edge" } });
-    let put =
-        async |headers: &[(&str, &str)], body: &Value| api.send_with("PUT", "/api/v1/layers/edge", headers, body).await;
+    let put = async |headers: &[(&str, &str)], body: &Value| {
+        api.send_with("PUT", "/api/v1/layers/edge", headers, body).await
+    };
     let bare = put(&[], &other).await;
     assert_eq!(bare.code(), (428, "precondition_required".to_owned()));
     assert_eq!(bare.json()["revision"], read.json()["revision"]);
@@ -60,20 +50,13 @@ async fn a_document_lives() {
     );
 
     let patch = json!({ "labels": { "site": null, "tier": "a" } });
-    let patched = api
-        .send_with("PATCH", "/api/v1/layers/edge", &[("if-match", "*")], &patch)
-        .await;
+    let patched = api.send_with("PATCH", "/api/v1/layers/edge", &[("if-match", "*")], &patch).await;
     assert_eq!(
         (patched.status.as_u16(), &patched.json()["labels"]),
         (200, &json!({ "tier": "a" }))
     );
     assert_eq!(api.send("PATCH", "/api/v1/layers/edge", &patch).await.status, 428);
-    assert_eq!(
-        api.send("PATCH", "/api/v1/layers/none", &json!({ "colour": 1 }))
-            .await
-            .status,
-        404
-    );
+    assert_eq!(api.send("PATCH", "/api/v1/layers/none", &json!({ "colour": 1 })).await.status, 404);
 
     let history = api.get("/api/v1/layers/edge/history?view=full&limit=2").await.json();
     assert_eq!(history["items"].as_array().unwrap().len(), 2);
@@ -84,26 +67,17 @@ async fn a_document_lives() {
         api.get("/api/v1/layers/edge/diff").await.code(),
         (400, "invalid_request".to_owned())
     );
-    let back = api
-        .send("POST", "/api/v1/layers/edge/rollback", &json!({ "revision": 1 }))
-        .await;
+    let back = api.send("POST", "/api/v1/layers/edge/rollback", &json!({ "revision": 1 })).await;
     assert_eq!((back.status.as_u16(), &back.json()["labels"]), (200, &json!({})));
 
     assert_eq!(api.call("DELETE", "/api/v1/layers/edge", &[], "").await.status, 428);
-    let gone = api
-        .call("DELETE", "/api/v1/layers/edge", &[("if-match", "*")], "")
-        .await;
+    let gone = api.call("DELETE", "/api/v1/layers/edge", &[("if-match", "*")], "").await;
     assert_eq!((gone.status.as_u16(), gone.body.len()), (204, 0));
     assert!(!gone.header("blaze-revision").is_empty());
     assert_eq!(api.get("/api/v1/layers/edge").await.status, 404);
     assert_eq!(api.call("DELETE", "/api/v1/layers/edge", &[], "").await.status, 404);
-    let made = api
-        .send_with("PUT", "/api/v1/layers/edge", &[("if-none-match", "*")], &other)
-        .await;
-    assert_eq!(
-        (made.status.as_u16(), made.header("location")),
-        (201, "/api/v1/layers/edge")
-    );
+    let made = api.send_with("PUT", "/api/v1/layers/edge", &[("if-none-match", "*")], &other).await;
+    assert_eq!((made.status.as_u16(), made.header("location")), (201, "/api/v1/layers/edge"));
 }
 
 #[tokio::test]
@@ -113,20 +87,12 @@ async fn a_request_may_come_twice() {
     let first = api.send_with("POST", "/api/v1/layers", &key, &layer()).await;
     assert_eq!((first.status.as_u16(), first.header("idempotent-replayed")), (201, ""));
     let again = api.send_with("POST", "/api/v1/layers", &key, &layer()).await;
-    assert_eq!(
-        (again.status.as_u16(), again.header("idempotent-replayed")),
-        (201, "true")
-    );
-    assert_eq!(
-        (again.json(), again.header("location")),
-        (first.json(), "/api/v1/layers/edge")
-    );
+    assert_eq!((again.status.as_u16(), again.header("idempotent-replayed")), (201, "true"));
+    assert_eq!((again.json(), again.header("location")), (first.json(), "/api/v1/layers/edge"));
     let other = json!({ "name": "fog", "spec": { "kind": "fog" } });
     let reused = api.send_with("POST", "/api/v1/layers", &key, &other).await;
     assert_eq!(reused.code(), (422, "idempotency_key_reused".to_owned()));
-    let bad = api
-        .send_with("POST", "/api/v1/layers", &[("idempotency-key", "a b")], &other)
-        .await;
+    let bad = api.send_with("POST", "/api/v1/layers", &[("idempotency-key", "a b")], &other).await;
     assert_eq!(bad.code(), (400, "invalid_header".to_owned()));
 }
 
@@ -158,16 +124,15 @@ async fn many_documents_are_one_commit() {
         .send(
             "POST",
             "/api/v1/apply",
-            &json!([{ "kind": "Layer", "name": "a", "spec": { "kind": "edge" } }, { "kind": "Layer" }]),
+            &json!([
+                { "kind": "Layer", "name": "a", "spec": { "kind": "edge" } },
+                { "kind": "Layer" },
+            ]),
         )
         .await;
-    assert_eq!(
-        (faulty.status.as_u16(), &faulty.json()["errors"][0]["document"]),
-        (422, &json!(1))
-    );
-    let reverted = api
-        .send("POST", "/api/v1/revert", &json!({ "revision": applied["revision"] }))
-        .await;
+    assert_eq!((faulty.status.as_u16(), &faulty.json()["errors"][0]["document"]), (422, &json!(1)));
+    let reverted =
+        api.send("POST", "/api/v1/revert", &json!({ "revision": applied["revision"] })).await;
     assert_eq!(
         (reverted.status.as_u16(), &reverted.json()["results"][0]["action"]),
         (200, &json!("deleted"))
@@ -202,13 +167,8 @@ async fn the_rest_of_the_routes_answers() {
         api.get("/api/v1/layers?page_token=x").await.code(),
         (400, "invalid_page_token".to_owned())
     );
-    let token = api
-        .send(
-            "POST",
-            "/api/v1/tokens",
-            &json!({ "subject": "a", "roles": ["viewer"] }),
-        )
-        .await;
+    let token =
+        api.send("POST", "/api/v1/tokens", &json!({ "subject": "a", "roles": ["viewer"] })).await;
     assert_eq!(token.code(), (409, "signing_disabled".to_owned()));
     assert_eq!(api.call("DELETE", "/api/v1/tokens/none", &[], "").await.status, 404);
     assert_eq!(

@@ -49,17 +49,11 @@ impl Reply {
     }
 
     fn code(&self) -> (u16, String) {
-        (
-            self.status.as_u16(),
-            self.json()["code"].as_str().unwrap_or_default().to_owned(),
-        )
+        (self.status.as_u16(), self.json()["code"].as_str().unwrap_or_default().to_owned())
     }
 
     fn header(&self, name: &str) -> &str {
-        self.headers
-            .get(name)
-            .and_then(|value| value.to_str().ok())
-            .unwrap_or_default()
+        self.headers.get(name).and_then(|value| value.to_str().ok()).unwrap_or_default()
     }
 }
 
@@ -71,11 +65,7 @@ fn api(supervisor: Supervisor, service: ConfigService, limits: &LimitsSection) -
         readiness: Readiness::new(),
         metrics: Arc::clone(&metrics),
     };
-    Api {
-        router: router(service, options),
-        metrics,
-        _supervisor: supervisor,
-    }
+    Api { router: router(service, options), metrics, _supervisor: supervisor }
 }
 
 /// Everybody is an administrator.
@@ -113,18 +103,14 @@ async fn guarded(limits: &LimitsSection, authenticator: Option<Arc<Authenticator
 
 impl Api {
     async fn call(&self, method: &str, path: &str, headers: &[(&str, &str)], body: &str) -> Reply {
-        let mut request = Request::builder()
-            .method(method)
-            .uri(path)
-            .header("host", "localhost:8080");
+        let mut request =
+            Request::builder().method(method).uri(path).header("host", "localhost:8080");
         for (name, value) in headers {
             request = request.header(*name, *value);
         }
         let peer: SocketAddr = "127.0.0.1:40000".parse().unwrap();
-        let request = request
-            .extension(ConnectInfo(peer))
-            .body(Body::from(body.to_owned()))
-            .unwrap();
+        let request =
+            request.extension(ConnectInfo(peer)).body(Body::from(body.to_owned())).unwrap();
         let response = self.router.clone().oneshot(request).await.unwrap();
         let (parts, body) = response.into_parts();
         let collected = tokio::time::timeout(SOON, body.collect()).await;
@@ -143,7 +129,13 @@ impl Api {
         self.send_with(method, path, &[], body).await
     }
 
-    async fn send_with(&self, method: &str, path: &str, headers: &[(&str, &str)], body: &Value) -> Reply {
+    async fn send_with(
+        &self,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: &Value,
+    ) -> Reply {
         let mut headers = headers.to_vec();
         headers.push(("content-type", "application/json"));
         self.call(method, path, &headers, &body.to_string()).await
@@ -162,9 +154,5 @@ fn layer() -> Value {
 
 /// A path of a route with names that fit.
 fn path_of(route: &routes::Route) -> String {
-    route
-        .path
-        .replace("{service}", "slam")
-        .replace("{name}", "edge")
-        .replace("{id}", "0197c1d2")
+    route.path.replace("{service}", "slam").replace("{name}", "edge").replace("{id}", "0197c1d2")
 }

@@ -10,15 +10,8 @@ async fn without_a_token_everything_below_api_is_401() {
     let api = locked(&NO_LIMITS).await;
     let mut paths: Vec<String> = routes::all().map(path_of).collect();
     paths.extend(
-        [
-            "/api/",
-            "/api/v1",
-            "/api/v2/nodes",
-            "/api/v1/nodes/",
-            "/api//v1",
-            "/api/v1/nodes/%2e",
-        ]
-        .map(str::to_owned),
+        ["/api/", "/api/v1", "/api/v2/nodes", "/api/v1/nodes/", "/api//v1", "/api/v1/nodes/%2e"]
+            .map(str::to_owned),
     );
     for path in paths {
         for method in ["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"] {
@@ -113,26 +106,18 @@ async fn a_role_opens_what_its_rights_say() {
     let denied = async {
         loop {
             let headers = [("authorization", admin.as_str())];
-            let audit = api
-                .call("GET", "/api/v1/audit?outcome=denied", &headers, "")
-                .await
-                .json();
+            let audit = api.call("GET", "/api/v1/audit?outcome=denied", &headers, "").await.json();
             if audit["items"][0]["code"] == "permission_denied" {
                 return;
             }
         }
     };
-    tokio::time::timeout(SOON, denied)
-        .await
-        .expect("refusals are in the audit");
+    tokio::time::timeout(SOON, denied).await.expect("refusals are in the audit");
 }
 
 #[tokio::test]
 async fn refused_tokens_close_the_address() {
-    let limits = LimitsSection {
-        auth_failures_per_s: 1,
-        ..NO_LIMITS
-    };
+    let limits = LimitsSection { auth_failures_per_s: 1, ..NO_LIMITS };
     let api = locked(&limits).await;
     let bad = [("authorization", "Bearer x")];
     let closed = repeat_until(429, async || api.call("GET", "/api/v1/nodes", &bad, "").await).await;
@@ -181,26 +166,13 @@ async fn the_route_is_looked_at_in_its_order() {
         api.call("GET", "/api/v1/nodes?x=1", &html, "").await.code(),
         (406, "not_acceptable".to_owned())
     );
-    assert_eq!(
-        api.get("/api/v1/nodes?x=1").await.code(),
-        (400, "unknown_parameter".to_owned())
-    );
-    assert_eq!(
-        api.get("/api/v1/nodes?limit=0").await.code(),
-        (400, "invalid_request".to_owned())
-    );
+    assert_eq!(api.get("/api/v1/nodes?x=1").await.code(), (400, "unknown_parameter".to_owned()));
+    assert_eq!(api.get("/api/v1/nodes?limit=0").await.code(), (400, "invalid_request".to_owned()));
     for method in ["OPTIONS", "POST"] {
         let reply = api.call(method, "/livez?x=1", &[], "").await;
         assert_eq!((reply.status.as_u16(), reply.header("allow")), (405, "GET, HEAD"));
     }
-    for page in [
-        "/livez",
-        "/readyz",
-        "/version",
-        "/openapi.json",
-        "/docs",
-        "/docs/errors/in_use",
-    ] {
+    for page in ["/livez", "/readyz", "/version", "/openapi.json", "/docs", "/docs/errors/in_use"] {
         for query in ["x=1", "verbose"] {
             let reply = api.get(&format!("{page}?{query}")).await;
             assert_eq!(reply.code(), (400, "unknown_parameter".to_owned()), "{page}?{query}");
@@ -217,10 +189,7 @@ async fn bodies_are_looked_at_in_their_order() {
     let large = "x".repeat(1024 * 1024 + 1);
     let length = large.len().to_string();
     let announced = [("content-type", "text/plain"), ("content-length", length.as_str())];
-    assert_eq!(
-        api.call("POST", "/api/v1/nodes?x=1", &announced, &large).await.status,
-        413
-    );
+    assert_eq!(api.call("POST", "/api/v1/nodes?x=1", &announced, &large).await.status, 413);
     assert_eq!(api.call("POST", "/api/v1/nodes?x=1", &text, "{}").await.status, 415);
     assert_eq!(
         api.send("POST", "/api/v1/nodes?x=1", &json!({})).await.code().1,
@@ -231,21 +200,13 @@ async fn bodies_are_looked_at_in_their_order() {
         (patch.status.as_u16(), patch.header("accept-patch")),
         (415, "application/merge-patch+json, application/json")
     );
-    for bad in [
-        "",
-        "{",
-        "{\"a\":1,\"a\":2}",
-        "{\"a\":9007199254740993}",
-        &"[".repeat(40),
-    ] {
-        let reply = api
-            .call("POST", "/api/v1/nodes", &[("content-type", "application/json")], bad)
-            .await;
+    for bad in ["", "{", "{\"a\":1,\"a\":2}", "{\"a\":9007199254740993}", &"[".repeat(40)] {
+        let reply =
+            api.call("POST", "/api/v1/nodes", &[("content-type", "application/json")], bad).await;
         assert_eq!(reply.code(), (400, "invalid_request".to_owned()), "{bad}");
     }
-    let unquoted = api
-        .send_with("PUT", "/api/v1/layers/edge", &[("if-match", "1")], &layer())
-        .await;
+    let unquoted =
+        api.send_with("PUT", "/api/v1/layers/edge", &[("if-match", "1")], &layer()).await;
     assert_eq!(unquoted.code(), (400, "invalid_header".to_owned()));
     let unknown = api
         .send(
@@ -271,12 +232,7 @@ async fn every_answer_has_its_headers() {
     let api = open().await;
     let trace = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01";
     let reply = api
-        .call(
-            "GET",
-            "/api/v1/nodes",
-            &[("x-request-id", "run-7"), ("traceparent", trace)],
-            "",
-        )
+        .call("GET", "/api/v1/nodes", &[("x-request-id", "run-7"), ("traceparent", trace)], "")
         .await;
     assert_eq!(reply.status, 200);
     for (name, value) in [
@@ -289,9 +245,7 @@ async fn every_answer_has_its_headers() {
     ] {
         assert_eq!(reply.header(name), value, "{name}");
     }
-    let refused = api
-        .call("GET", "/api/v1/nodes/none", &[("x-request-id", "a b")], "")
-        .await;
+    let refused = api.call("GET", "/api/v1/nodes/none", &[("x-request-id", "a b")], "").await;
     assert_eq!((refused.status.as_u16(), refused.header("blaze-revision")), (404, "0"));
     let problem = refused.json();
     assert_eq!(refused.header("content-type"), "application/problem+json");
@@ -309,7 +263,9 @@ async fn every_answer_has_its_headers() {
     assert_eq!(api.get(&format!("/nothing?{}", "x".repeat(8 * 1024))).await.status, 414);
     let text = api.metrics.text();
     assert!(
-        text.contains("blaze_config_requests_total{api=\"rest\",code=\"not_found\",operation=\"get_node\"} 1"),
+        text.contains(
+            "blaze_config_requests_total{api=\"rest\",code=\"not_found\",operation=\"get_node\"} 1"
+        ),
         "{text}"
     );
 }
@@ -341,10 +297,7 @@ async fn a_request_with_two_hosts_is_refused_everywhere() {
 
 #[tokio::test]
 async fn slow_bodies_take_no_place_among_those_at_work() {
-    let limits = LimitsSection {
-        in_flight: 1,
-        ..NO_LIMITS
-    };
+    let limits = LimitsSection { in_flight: 1, ..NO_LIMITS };
     let api = open_with(&limits).await;
     let send = |body: Body| {
         let request = Request::builder()
@@ -356,7 +309,8 @@ async fn slow_bodies_take_no_place_among_those_at_work() {
             .unwrap();
         Box::pin(api.router.clone().oneshot(request))
     };
-    let never = || Body::from_stream(futures::stream::pending::<Result<Bytes, std::convert::Infallible>>());
+    let never =
+        || Body::from_stream(futures::stream::pending::<Result<Bytes, std::convert::Infallible>>());
     let mut slow = [send(never()), send(never()), send(never())];
     for one in &mut slow {
         assert!(futures::FutureExt::now_or_never(one).is_none());
@@ -389,10 +343,7 @@ async fn a_body_that_never_comes_has_changed_nothing() {
 
 #[tokio::test]
 async fn too_much_at_once_is_refused() {
-    let limits = LimitsSection {
-        requests_per_s: 1,
-        ..NO_LIMITS
-    };
+    let limits = LimitsSection { requests_per_s: 1, ..NO_LIMITS };
     let api = open_with(&limits).await;
     let refused = repeat_until(429, async || api.get("/api/v1/nodes").await).await;
     assert_eq!(refused.code(), (429, "rate_limited".to_owned()));

@@ -27,11 +27,7 @@ async fn a_watch_tells_commits() {
         for (name, value) in headers {
             request = request.header(*name, *value);
         }
-        api.router
-            .clone()
-            .oneshot(request.body(Body::empty()).unwrap())
-            .await
-            .unwrap()
+        api.router.clone().oneshot(request.body(Body::empty()).unwrap()).await.unwrap()
     };
     let first = watch("/api/v1/watch?since=0", &[]).await;
     assert_eq!(first.status(), 200);
@@ -62,15 +58,11 @@ async fn a_watch_tells_commits() {
         (400, "invalid_request".to_owned())
     );
     assert_eq!(
-        api.call("GET", "/api/v1/watch", &[("last-event-id", "x")], "")
-            .await
-            .code(),
+        api.call("GET", "/api/v1/watch", &[("last-event-id", "x")], "").await.code(),
         (400, "invalid_header".to_owned())
     );
     assert_eq!(
-        api.call("GET", "/api/v1/watch", &[("accept", "application/json")], "")
-            .await
-            .status,
+        api.call("GET", "/api/v1/watch", &[("accept", "application/json")], "").await.status,
         406
     );
 }

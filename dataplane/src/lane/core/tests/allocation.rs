@@ -18,19 +18,13 @@ struct Limited {
 
 impl Limited {
     fn new(limit_bytes_per_s: f64, lane: LaneSpec, rate_hz: Option<f64>) -> Self {
-        let bridge = Bridge {
-            lane,
-            ..bridge(Scope::Node, to_cloud())
-        };
+        let bridge = Bridge { lane, ..bridge(Scope::Node, to_cloud()) };
         Self::with(limit_bytes_per_s, vec![bridge], rate_hz)
     }
 
     fn with(limit_bytes_per_s: f64, bridges: Vec<Bridge>, rate_hz: Option<f64>) -> Self {
         let mut bench = Bench::new(Vec::new());
-        let info = TopicInfo {
-            rate_hz,
-            ..TopicInfo::default()
-        };
+        let info = TopicInfo { rate_hz, ..TopicInfo::default() };
         bench.apply(bridges, info);
         let limiter = Limiter::new(BandwidthSection {
             limit_mbps: limit_bytes_per_s * 8.0 / (1024.0 * 1024.0),
@@ -40,11 +34,7 @@ impl Limited {
             wire_overhead: WireOverhead::Off,
             ..BandwidthSection::default()
         });
-        let mut limited = Self {
-            bench,
-            limiter,
-            sequence: 0,
-        };
+        let mut limited = Self { bench, limiter, sequence: 0 };
         limited.allocate();
         limited
     }
@@ -73,7 +63,8 @@ impl Limited {
         }
     }
 
-    /// Publishes at a rate for so many seconds, and works the rates out every half of one. How many passed.
+    /// Publishes at a rate for so many seconds, and works the rates out every half of one. How many
+    /// passed.
     fn publish(&mut self, hz: u32, bytes: usize, seconds: u32) -> usize {
         let before = self.bench.link.submitted.len();
         let every = Duration::from_secs(1) / hz;
@@ -116,18 +107,12 @@ fn a_large_topic_is_thinned_to_what_the_budget_holds() {
     let mut limited = Limited::new(1_000_000.0, lane_spec(), Some(30.0));
     limited.publish(30, 100_000, 1);
     let passed = limited.publish(30, 100_000, 10);
-    assert!(
-        (99..=101).contains(&passed),
-        "{passed} images of 100 kB in 10 s at 1 MB/s"
-    );
+    assert!((99..=101).contains(&passed), "{passed} images of 100 kB in 10 s at 1 MB/s");
     let path = limited.path();
     assert_eq!(path.granted.map(|granted| granted.size_bytes), Some(100_000));
     assert_eq!(path.bridges[0].allocated_hz, Some(10.0));
     let dropped = limited.dropped();
-    assert!(
-        dropped.len() == 1 && dropped[0].0 == DropReason::RateLimit,
-        "{dropped:?}"
-    );
+    assert!(dropped.len() == 1 && dropped[0].0 == DropReason::RateLimit, "{dropped:?}");
 }
 
 #[test]
@@ -202,13 +187,11 @@ fn a_lane_runs_at_the_smaller_of_asked_and_allocated() {
     let passed = limited.publish(30, 100_000, 10);
     assert!((49..=53).contains(&passed), "{passed}");
     let dropped = limited.dropped();
-    assert!(
-        dropped.iter().all(|(reason, _)| *reason == DropReason::MaxRate),
-        "{dropped:?}"
-    );
+    assert!(dropped.iter().all(|(reason, _)| *reason == DropReason::MaxRate), "{dropped:?}");
 }
 
-/// As LZ4 makes images: the wire carries less than the largest of them each time, and ω has to know.
+/// As LZ4 makes images: the wire carries less than the largest of them each time, and ω has to
+/// know.
 #[test]
 fn each_message_is_reckoned_as_the_largest() {
     let mut limited = Limited::new(1e9, lane_spec(), Some(10.0));
@@ -229,27 +212,20 @@ fn each_message_is_reckoned_as_the_largest() {
     assert_eq!(limited.bench.core.reckoned(std::iter::empty()), reckoned);
 }
 
-/// An image takes seconds on a slow link: what of it has left counts, or the wire factor would jump with each.
+/// An image takes seconds on a slow link: what of it has left counts, or the wire factor would jump
+/// with each.
 #[test]
 fn a_message_that_is_being_sent_is_reckoned_by_what_has_left() {
     let mut limited = Limited::new(1e9, lane_spec(), Some(10.0));
     limited.post(Scope::Node, 0, 100_000);
     let (lane, ..) = limited.bench.link.submitted[0];
     let of = |parts_sent| {
-        let begun = Begun {
-            payload_bytes: 40_000,
-            parts_sent,
-            parts: 50,
-        };
+        let begun = Begun { payload_bytes: 40_000, parts_sent, parts: 50 };
         limited.bench.core.reckoned(std::iter::once((lane, begun))).all
     };
     assert_eq!((of(0), of(10), of(50)), (100_000, 120_000, 200_000));
     // And if the rest of it is dropped that does not come back.
-    let begun = Begun {
-        payload_bytes: 40_000,
-        parts_sent: 10,
-        parts: 50,
-    };
+    let begun = Begun { payload_bytes: 40_000, parts_sent: 10, parts: 50 };
     limited.bench.core.lane_cut(lane, begun);
     assert_eq!(limited.bench.core.reckoned(std::iter::empty()).all, 120_000);
 }
@@ -326,11 +302,9 @@ fn what_goes_to_one_receiver_from_two_scopes_is_one_lane() {
     publish(&mut limited, [Scope::Node, Scope::Layer], 2);
     let wanted = limited.bench.core.wanted(limited.bench.now);
     assert_eq!(wanted.demands()[0].lanes.len(), 1, "one copy");
-    for scopes in [
-        [Scope::Node, Scope::Layer],
-        [Scope::Layer, Scope::Layer],
-        [Scope::Node, Scope::Node],
-    ] {
+    for scopes in
+        [[Scope::Node, Scope::Layer], [Scope::Layer, Scope::Layer], [Scope::Node, Scope::Node]]
+    {
         let passed = publish(&mut limited, scopes, 10);
         assert!((99..=101).contains(&passed), "{passed} in 10 s from {scopes:?}");
     }
@@ -342,10 +316,7 @@ fn what_goes_to_one_receiver_from_two_scopes_is_one_lane() {
     let passed = publish(&mut limited, [Scope::Node, Scope::Layer], 10);
     assert!((49..=51).contains(&passed), "{passed} in 10 s");
     let dropped = limited.dropped();
-    assert!(
-        dropped.iter().all(|(reason, _)| *reason == DropReason::MaxRate),
-        "{dropped:?}"
-    );
+    assert!(dropped.iter().all(|(reason, _)| *reason == DropReason::MaxRate), "{dropped:?}");
 }
 
 /// Else a flow that has to skip half would seem to carry no more than it can.
@@ -356,16 +327,9 @@ fn what_the_budget_skips_is_load_and_what_nobody_asks_for_is_not() {
     let mut load = 0;
     for _ in 0..20 {
         limited.publish(40, 100_000, 1);
-        load = limited
-            .bench
-            .core
-            .measure(limited.bench.now, &limited.bench.link)
-            .out_bytes_per_s;
+        load = limited.bench.core.measure(limited.bench.now, &limited.bench.link).out_bytes_per_s;
     }
-    assert!(
-        (1_900_000..2_200_000).contains(&load),
-        "{load}: 20 of 40 messages, of which 10 fit"
-    );
+    assert!((1_900_000..2_200_000).contains(&load), "{load}: 20 of 40 messages, of which 10 fit");
     let dropped: BTreeMap<_, _> = limited.dropped().into_iter().collect();
     assert!(
         dropped[&DropReason::RateLimit] > 150 && dropped[&DropReason::MaxRate] > 350,
@@ -391,27 +355,18 @@ fn what_is_kept_for_late_joiners_passes_whatever_the_rate() {
     limited.bench.now += Duration::from_secs(1);
     limited.allocate();
     let granted = limited.path().granted.unwrap();
-    assert_eq!(
-        (granted.size_bytes, granted.advertised_hz),
-        (1_000, 0.0),
-        "it is no rate"
-    );
+    assert_eq!((granted.size_bytes, granted.advertised_hz), (1_000, 0.0), "it is no rate");
 }
 
 #[test]
 fn a_lane_that_drains_has_no_rate_any_more() {
-    let to_fog = Target::Inter {
-        layer: "fog".parse().unwrap(),
-        receiver: "fog/fog-1".parse().unwrap(),
-    };
+    let to_fog =
+        Target::Inter { layer: "fog".parse().unwrap(), receiver: "fog/fog-1".parse().unwrap() };
     let (cloud, fog) = (bridge(Scope::Node, to_cloud()), bridge(Scope::Node, to_fog));
     let mut limited = Limited::with(1_000_000.0, vec![cloud, fog.clone()], Some(30.0));
     limited.publish(30, 100_000, 2);
     assert_eq!(limited.rates(), [Some(5.0); 2]);
-    let info = TopicInfo {
-        rate_hz: Some(30.0),
-        ..TopicInfo::default()
-    };
+    let info = TopicInfo { rate_hz: Some(30.0), ..TopicInfo::default() };
     limited.bench.apply(vec![fog], info);
     assert!(limited.bench.core.take_lanes_changed());
     limited.allocate();
@@ -421,14 +376,13 @@ fn a_lane_that_drains_has_no_rate_any_more() {
         .into_iter()
         .map(|lane| (lane.receiver.to_string(), lane.allocated_hz))
         .collect();
-    assert_eq!(
-        lanes,
-        [("cloud/cloud-1".to_owned(), None), ("fog/fog-1".to_owned(), Some(10.0))]
-    );
+    assert_eq!(lanes, [("cloud/cloud-1".to_owned(), None), ("fog/fog-1".to_owned(), Some(10.0))]);
     limited.bench.apply(Vec::new(), TopicInfo::default());
     limited.allocate();
     assert_eq!(limited.rates(), [None, None]);
-    assert!(limited.path().granted.is_none() && limited.bench.core.wanted(limited.bench.now).is_empty());
+    assert!(
+        limited.path().granted.is_none() && limited.bench.core.wanted(limited.bench.now).is_empty()
+    );
     assert!(limited.lanes().is_empty());
 }
 
@@ -453,7 +407,8 @@ fn facts_are_taken_a_few_topics_at_a_time() {
     assert_eq!(names, ["imu/data", "a", "b", "c", "d"]);
 }
 
-/// Images are admitted as unevenly as they come. Of a fast topic one more may wait for that; of a slow one an older image is of no use.
+/// Images are admitted as unevenly as they come. Of a fast topic one more may wait for that; of a
+/// slow one an older image is of no use.
 #[test]
 fn of_a_fast_topic_more_than_one_image_may_wait() {
     for (bytes_per_s, waiting) in [(1_000_000.0, 1), (2_500_000.0, 3)] {

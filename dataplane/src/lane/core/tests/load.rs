@@ -14,10 +14,8 @@ fn to_node() -> Target {
 impl Bench {
     /// A bridge out of the layer, and one into it.
     fn of_layer() -> Self {
-        let mut bench = Self::new(vec![
-            bridge(Scope::Layer, to_cloud()),
-            bridge(Scope::Inter, Target::Layer),
-        ]);
+        let mut bench =
+            Self::new(vec![bridge(Scope::Layer, to_cloud()), bridge(Scope::Inter, Target::Layer)]);
         bench.core.reads_from(bench.topic, &[0]);
         bench
     }
@@ -29,15 +27,10 @@ impl Bench {
             at: self.now,
             broker_age_us: 0,
             kept: false,
-            place: Some(Place {
-                partition: 0,
-                offset,
-                appended_ms: None,
-            }),
+            place: Some(Place { partition: 0, offset, appended_ms: None }),
         };
         let mut batch: Vec<Received> = offsets.clone().map(received).collect();
-        self.core
-            .ingest(self.now, WALL, self.topic, Scope::Layer, &mut batch, &mut self.link);
+        self.core.ingest(self.now, WALL, self.topic, Scope::Layer, &mut batch, &mut self.link);
         for _ in offsets {
             self.core.lane_sent(self.now, LaneId(0), 1000, Duration::ZERO);
         }
@@ -65,19 +58,13 @@ fn both_directions_are_measured_and_the_carried_topics_are_told() {
     let mut bench = Bench::of_layer();
     assert!(!bench.run(0..3).carried[0].may_move, "measured for too short a time");
     let loads = bench.run(3..6);
-    let carried = TopicLoad {
-        topic: "imu/data".parse().unwrap(),
-        bytes_per_s: 10_000,
-        may_move: true,
-    };
+    let carried =
+        TopicLoad { topic: "imu/data".parse().unwrap(), bytes_per_s: 10_000, may_move: true };
     assert_eq!((loads.out_bytes_per_s, loads.in_bytes_per_s), (10_000, 0));
     assert_eq!(loads.carried, [carried]);
     bench.deliver(message(["fog", "", ""], 9, 1, 0, 6000).with_hops_and_age(1, 0));
     let taken_in = bench.run(6..7).in_bytes_per_s;
-    assert!(
-        (500..1500).contains(&taken_in),
-        "6000 bytes in one of seven seconds: {taken_in}"
-    );
+    assert!((500..1500).contains(&taken_in), "6000 bytes in one of seven seconds: {taken_in}");
 }
 
 #[test]
@@ -94,7 +81,9 @@ fn a_topic_whose_lane_is_behind_or_whose_peer_is_silent_stays() {
     let mut bench = Bench::of_layer();
     assert!(bench.run(0..8).carried[0].may_move);
     // Ten a second: in a quarter of a second two or three leave, and one more may be on its way.
-    for (queued, silent, may_move) in [(0, true, true), (1, true, false), (3, false, true), (4, false, false)] {
+    for (queued, silent, may_move) in
+        [(0, true, true), (1, true, false), (3, false, true), (4, false, false)]
+    {
         bench.link.waiting.insert(LaneId(0), queued);
         bench.link.refuse = silent;
         assert_eq!(bench.may_move(), may_move, "{queued} queued, silent {silent}");

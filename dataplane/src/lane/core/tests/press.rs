@@ -37,12 +37,7 @@ fn lane(receiver: &str, reliable: bool) -> Bridge {
 
 fn rules(level: u8, adaptive: bool) -> CompressionRules {
     CompressionRules {
-        base: Compression {
-            codec: Codec::Lz4,
-            level,
-            min_bytes: 1_000,
-            adaptive,
-        },
+        base: Compression { codec: Codec::Lz4, level, min_bytes: 1_000, adaptive },
         topics: Vec::new(),
     }
 }
@@ -52,12 +47,7 @@ impl Hands {
         let mut bench = Bench::new(bridges);
         bench.core.enable_compression();
         bench.core.set_compression(rules(1, false));
-        Self {
-            bench,
-            quick: 0,
-            long: 0,
-            jobs: Vec::new(),
-        }
+        Self { bench, quick: 0, long: 0, jobs: Vec::new() }
     }
 
     /// What is asked of the pool, and of the caller.
@@ -99,9 +89,7 @@ impl Hands {
     /// What was begun ends like this.
     fn end_with(&mut self, at: usize, done: Done) {
         let job = self.jobs.remove(at);
-        self.bench
-            .core
-            .pressed(self.bench.now, job.ticket, done, &mut self.bench.link);
+        self.bench.core.pressed(self.bench.now, job.ticket, done, &mut self.bench.link);
         self.look();
     }
 
@@ -160,9 +148,8 @@ impl Hands {
     /// Lane, writer and sequence of what the link got since the last call.
     fn sent(&mut self) -> Vec<(u32, u8, u64)> {
         let sent = std::mem::take(&mut self.bench.link.submitted);
-        let told = sent
-            .iter()
-            .map(|(lane, _, frame)| (lane.0, frame.writer().0[0], frame.sequence()));
+        let told =
+            sent.iter().map(|(lane, _, frame)| (lane.0, frame.writer().0[0], frame.sequence()));
         told.collect()
     }
 

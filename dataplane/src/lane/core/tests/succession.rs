@@ -10,10 +10,7 @@ const LATER: Duration = Duration::from_millis(100);
 
 fn to(flow: &str) -> Target {
     let receiver: FlowId = format!("cloud/{flow}").parse().unwrap();
-    Target::Inter {
-        layer: receiver.layer.clone(),
-        receiver,
-    }
+    Target::Inter { layer: receiver.layer.clone(), receiver }
 }
 
 fn reliable(flow: &str) -> Vec<Bridge> {
@@ -38,7 +35,8 @@ impl Bench {
 
     /// Messages of writer 1 from the own node.
     fn send(&mut self, sequences: std::ops::RangeInclusive<u64>, bytes: usize) {
-        let contents = sequences.map(|sequence| Content::Frame(frame(1, sequence, "robot-1", 0, bytes)));
+        let contents =
+            sequences.map(|sequence| Content::Frame(frame(1, sequence, "robot-1", 0, bytes)));
         self.take(Scope::Node, contents.collect());
     }
 
@@ -69,8 +67,7 @@ impl Bench {
     /// A flow says that it has written what it was asked for last.
     fn answer(&mut self, flow: &str) {
         let tokens = self.asked(flow);
-        self.core
-            .written(&format!("cloud/{flow}").parse().unwrap(), tokens[tokens.len() - 1]);
+        self.core.written(&format!("cloud/{flow}").parse().unwrap(), tokens[tokens.len() - 1]);
         self.drain();
     }
 
@@ -108,10 +105,7 @@ fn the_next_receiver_gets_nothing_before_the_one_before_has_written_all() {
     bench.core.written(&"cloud/b".parse().unwrap(), tokens[0]);
     bench.core.written(&"cloud/a".parse().unwrap(), tokens[0] + 1);
     bench.drain();
-    assert!(
-        bench.sent().is_empty(),
-        "neither another flow's answer nor one to another question"
-    );
+    assert!(bench.sent().is_empty(), "neither another flow's answer nor one to another question");
     bench.core.written(&"cloud/a".parse().unwrap(), tokens[0]);
     bench.drain();
     bench.send(6..=6, 10);
@@ -206,7 +200,9 @@ fn only_flows_on_one_broker_follow_one_another() {
         bridges[0].lane.shared = None;
         bridges
     };
-    let both = |one: Vec<Bridge>, other: Vec<Bridge>| -> Vec<Bridge> { one.into_iter().chain(other).collect() };
+    let both = |one: Vec<Bridge>, other: Vec<Bridge>| -> Vec<Bridge> {
+        one.into_iter().chain(other).collect()
+    };
     let mut bench = Bench::new(both(alone("robot-7"), reliable("a")));
     bench.send(1..=1, 10);
     assert_eq!(bench.sent(), [(0, 1), (1, 1)]);
@@ -252,10 +248,7 @@ fn what_nobody_goes_on_with_stays_until_it_is_planned_again() {
     bench.apply(vec![], TopicInfo::default());
     bench.pass(DRAIN);
     assert_eq!(
-        bench.core.path(bench.topic).bridges[1]
-            .stats
-            .dropped
-            .get(DropReason::NoDestination),
+        bench.core.path(bench.topic).bridges[1].stats.dropped.get(DropReason::NoDestination),
         2
     );
 }
@@ -424,10 +417,7 @@ fn a_question_is_answered_when_the_broker_has_what_had_come_by_then() {
     bench.deliver(of_cloud(4));
     bench.out.queued.store(2, Ordering::SeqCst);
     bench.pass(LATER);
-    assert!(
-        answers(&mut bench).is_empty(),
-        "two of four wait, one of them had come by then"
-    );
+    assert!(answers(&mut bench).is_empty(), "two of four wait, one of them had come by then");
     bench.out.queued.store(1, Ordering::SeqCst);
     bench.pass(LATER);
     assert_eq!(answers(&mut bench), [yes(3), yes(4)], "the one that waits came later");
@@ -459,10 +449,7 @@ fn questions_that_wait_are_bounded() {
     for number in 0..1_000 {
         let topic = format!("t/{number}");
         bench.add(&topic, vec![bridge(Scope::Inter, Target::Layer)]);
-        let origin = Origin {
-            layer: "cloud".into(),
-            ..Origin::default()
-        };
+        let origin = Origin { layer: "cloud".into(), ..Origin::default() };
         let header = Header::new(&topic, origin, WriterId([7; 16]), 1, WALL);
         let came = Frame::new(&header, Bytes::new()).unwrap();
         bench.deliver(came.with_hops_and_age(1, 0));

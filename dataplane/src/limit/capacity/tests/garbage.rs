@@ -6,29 +6,16 @@ use super::super::*;
 use crate::testing::Random;
 
 const BYTES: [u64; 6] = [0, 1, 1400, 1_000_000, u64::MAX / 2, u64::MAX];
-const NANOSECONDS: [u64; 7] = [0, 1, 1_000_000, 50_000_000, 2_000_000_000, 40_000_000_000, u64::MAX];
-const LIMITS: [f64; 10] = [
-    f64::NAN,
-    f64::INFINITY,
-    f64::NEG_INFINITY,
-    -1.0,
-    0.0,
-    1e-300,
-    1.0,
-    1e5,
-    2e7,
-    1e300,
-];
+const NANOSECONDS: [u64; 7] =
+    [0, 1, 1_000_000, 50_000_000, 2_000_000_000, 40_000_000_000, u64::MAX];
+const LIMITS: [f64; 10] =
+    [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -1.0, 0.0, 1e-300, 1.0, 1e5, 2e7, 1e300];
 
 fn is_sound(capacity: &Capacity, limit: f64) {
     let rate = capacity.bytes_per_s();
     let least = FLOOR_BYTES_PER_S.max(limit * FLOOR_SHARE).min(limit);
     assert!((least..=limit).contains(&rate), "{rate} of {limit}");
-    assert!(
-        capacity
-            .measured()
-            .is_none_or(|measured| measured > 0.0 && measured <= limit)
-    );
+    assert!(capacity.measured().is_none_or(|measured| measured > 0.0 && measured <= limit));
     assert!((0.0..=1.0).contains(&capacity.loss.ordinary));
 }
 
@@ -80,14 +67,7 @@ fn it_recovers_from_garbage() {
     ];
     for (delivered_bytes, lost_bytes, round_trip) in garbage {
         capacity.sent(now, usize::MAX);
-        capacity.feedback(
-            now,
-            &Seen {
-                delivered_bytes,
-                lost_bytes,
-                round_trip: Some(round_trip),
-            },
-        );
+        capacity.feedback(now, &Seen { delivered_bytes, lost_bytes, round_trip: Some(round_trip) });
     }
     for _ in 0..2000 {
         now += Duration::from_millis(50);

@@ -1,4 +1,5 @@
-//! A sender that is paced by an estimate, a bottleneck with a queue, and a receiver that reports. In steps of 1 ms.
+//! A sender that is paced by an estimate, a bottleneck with a queue, and a receiver that reports.
+//! In steps of 1 ms.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -30,13 +31,7 @@ pub(super) struct Link {
 impl Default for Link {
     /// The reference link with so much more than 20 MB/s that nothing waits.
     fn default() -> Self {
-        Self {
-            rate: 40e6,
-            queue: 8e6,
-            delay: 25,
-            jitter: 5,
-            loss: 0.0001,
-        }
+        Self { rate: 40e6, queue: 8e6, delay: 25, jitter: 5, loss: 0.0001 }
     }
 }
 
@@ -237,7 +232,8 @@ impl Simulator {
     }
 
     fn travel(&mut self) -> u64 {
-        self.link.delay.saturating_sub(self.link.jitter) + self.random.below(2 * self.link.jitter + 1)
+        self.link.delay.saturating_sub(self.link.jitter)
+            + self.random.below(2 * self.link.jitter + 1)
     }
 
     fn arrive(&mut self, wait: u64, lost: bool, sent: u64) {
@@ -257,7 +253,8 @@ impl Simulator {
         self.received += arrived.bytes;
         self.lost += arrived.lost;
         if arrived.datagrams > 0 {
-            // The first of what a stall has kept waiting is what a Feedback in the middle of it would echo.
+            // The first of what a stall has kept waiting is what a Feedback in the middle of it
+            // would echo.
             let kept = self.stalls[0].1 == self.now;
             let sent = if kept { arrived.first_sent } else { arrived.last_sent };
             self.echo = (sent, self.now);
@@ -303,12 +300,7 @@ impl Simulator {
     fn note(&mut self) {
         let (rate, queue) = (self.capacity.bytes_per_s(), self.waiting());
         if (self.now - 1).is_multiple_of(ENTRY) {
-            self.log.push(Entry {
-                sent: 0.0,
-                queue,
-                least_rate: rate,
-                most_rate: rate,
-            });
+            self.log.push(Entry { sent: 0.0, queue, least_rate: rate, most_rate: rate });
         }
         if let Some(entry) = self.log.last_mut() {
             entry.queue = entry.queue.max(queue);
@@ -326,15 +318,13 @@ impl Simulator {
     /// Bytes per second sent.
     pub(super) fn mean_sent(&self, from: f64, to: f64) -> f64 {
         let entries = self.between(from, to);
-        entries.iter().map(|entry| entry.sent).sum::<f64>() / entries.len() as f64 * 1000.0 / ENTRY as f64
+        entries.iter().map(|entry| entry.sent).sum::<f64>() / entries.len() as f64 * 1000.0
+            / ENTRY as f64
     }
 
     /// Longest wait before the bottleneck, in milliseconds.
     pub(super) fn longest_queue(&self, from: f64, to: f64) -> f64 {
-        self.between(from, to)
-            .iter()
-            .map(|entry| entry.queue)
-            .fold(0.0, f64::max)
+        self.between(from, to).iter().map(|entry| entry.queue).fold(0.0, f64::max)
     }
 
     pub(super) fn least_rate(&self, from: f64, to: f64) -> f64 {

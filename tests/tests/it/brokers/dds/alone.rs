@@ -6,7 +6,8 @@ use std::time::Duration;
 use blaze_brokers::dds::Fault;
 use blaze_brokers::dds::layer::DdsBroker;
 use blaze_brokers::{
-    Broker, BrokerError, Content, Health, PublishOutcome, PublisherOptions, Received, SubscribeOptions,
+    Broker, BrokerError, Content, Health, PublishOutcome, PublisherOptions, Received,
+    SubscribeOptions,
 };
 use blaze_domain::node_file::DdsLayerBroker as Section;
 
@@ -27,25 +28,15 @@ async fn a_missing_interface_is_down_with_its_reason() {
     let refused = broker.subscribe(&topic, SubscribeOptions::default()).await;
     assert!(matches!(refused, Err(BrokerError::Away(why)) if why.contains("192.0.2.1")));
     let publisher = broker.publisher(&topic, PublisherOptions::default()).unwrap();
-    assert_eq!(
-        publisher.publish(&frame(&topic, 1, 1, 1), None),
-        PublishOutcome::Dropped
-    );
+    assert_eq!(publisher.publish(&frame(&topic, 1, 1, 1), None), PublishOutcome::Dropped);
     broker.close().await;
     assert_eq!(broker.status().borrow().health, Health::Closed);
 }
 
 #[test]
 fn addresses_that_are_no_interface_are_refused() {
-    for interface in [
-        Ipv4Addr::UNSPECIFIED,
-        Ipv4Addr::BROADCAST,
-        Ipv4Addr::new(239, 255, 0, 1),
-    ] {
-        assert!(
-            DdsBroker::open(&Section { domain: 1, interface }).is_err(),
-            "{interface}"
-        );
+    for interface in [Ipv4Addr::UNSPECIFIED, Ipv4Addr::BROADCAST, Ipv4Addr::new(239, 255, 0, 1)] {
+        assert!(DdsBroker::open(&Section { domain: 1, interface }).is_err(), "{interface}");
     }
     let interface = Ipv4Addr::LOCALHOST;
     assert!(DdsBroker::open(&Section { domain: 101, interface }).is_err());
@@ -58,19 +49,15 @@ async fn a_participant_that_dies_is_built_anew_and_goes_on() {
     let topic = "faults".parse().unwrap();
     let mut there = other.subscribe(&topic, SubscribeOptions::default()).await.unwrap();
     let mut here = mortal.subscribe(&topic, SubscribeOptions::default()).await.unwrap();
-    let options = PublisherOptions {
-        reliable: true,
-        ..PublisherOptions::default()
-    };
-    let publishers = [
-        mortal.publisher(&topic, options).unwrap(),
-        other.publisher(&topic, options).unwrap(),
-    ];
+    let options = PublisherOptions { reliable: true, ..PublisherOptions::default() };
+    let publishers =
+        [mortal.publisher(&topic, options).unwrap(), other.publisher(&topic, options).unwrap()];
     let mut sequence = 0;
     for (round, fault) in (0..).zip([None, Some(Fault::Panic), Some(Fault::Hang)]) {
         if let Some(fault) = fault {
             mortal.inject(fault);
-            eventually("it is built anew", || (mortal.counts().rebuilds == round).then_some(())).await;
+            eventually("it is built anew", || (mortal.counts().rebuilds == round).then_some(()))
+                .await;
             wait_for(&mortal, Health::Up).await;
         }
         // Each still hears the other, on the publishers and subscriptions of before.
@@ -83,14 +70,17 @@ async fn a_participant_that_dies_is_built_anew_and_goes_on() {
                     for (number, publisher) in (1..).zip(&publishers) {
                         publisher.publish(&frame(&topic, number, sequence, 10), None);
                     }
-                    // What a participant publishes it hears itself at once, so hearing something is no pace.
+                    // What a participant publishes it hears itself at once, so hearing something is
+                    // no pace.
                     let next = tokio::time::Instant::now() + Duration::from_millis(20);
                     while tokio::time::timeout_at(next, subscription.receive(&mut batch, 64))
                         .await
                         .is_ok()
                     {}
                     let is_new = |content: &Content| match content {
-                        Content::Frame(frame) => frame.writer().0[0] == writer && frame.sequence() > begin,
+                        Content::Frame(frame) => {
+                            frame.writer().0[0] == writer && frame.sequence() > begin
+                        }
                         other => panic!("{other:?}"),
                     };
                     if batch.drain(..).any(|received| is_new(&received.content)) {
@@ -112,18 +102,12 @@ async fn what_is_published_while_it_is_built_anew_arrives() {
     let (mortal, other) = (domain.open().await, domain.open().await);
     let topic = "meanwhile".parse().unwrap();
     let mut there = other.subscribe(&topic, SubscribeOptions::default()).await.unwrap();
-    let options = PublisherOptions {
-        reliable: true,
-        ..PublisherOptions::default()
-    };
+    let options = PublisherOptions { reliable: true, ..PublisherOptions::default() };
     let publisher = mortal.publisher(&topic, options).unwrap();
     mortal.inject(Fault::Panic);
     wait_for(&mortal, Health::Down).await;
     for sequence in 1..=MESSAGES {
-        assert_eq!(
-            publisher.publish(&frame(&topic, 1, sequence, 1), None),
-            PublishOutcome::Taken
-        );
+        assert_eq!(publisher.publish(&frame(&topic, 1, sequence, 1), None), PublishOutcome::Taken);
     }
     let mut batch = Vec::new();
     while batch.len() < MESSAGES as usize {

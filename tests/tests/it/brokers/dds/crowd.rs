@@ -10,23 +10,19 @@ use bytes::Bytes;
 
 use super::support::{DEADLINE, Domain, eventually, frame};
 
-/// RustDDS keeps four events of a writer. Readers that ask for more than it offers fill them before the one that suits it
-/// comes.
+/// RustDDS keeps four events of a writer. Readers that ask for more than it offers fill them before
+/// the one that suits it comes.
 #[tokio::test]
 async fn a_writer_finds_its_reader_behind_a_crowd_of_others() {
     const OTHERS: usize = 6;
     let domain = Domain::start();
-    let participant = || Participant::start(ParticipantConfig::new(domain.id, Ipv4Addr::LOCALHOST)).unwrap();
+    let participant =
+        || Participant::start(ParticipantConfig::new(domain.id, Ipv4Addr::LOCALHOST)).unwrap();
     let (here, there) = (participant(), participant());
     let best_effort = Profile::best_effort(8);
-    let reliable = Profile {
-        reliable: true,
-        ..best_effort
-    };
-    let (first, second) = (
-        here.writer("crowd", best_effort).unwrap(),
-        here.writer("crowd", best_effort).unwrap(),
-    );
+    let reliable = Profile { reliable: true, ..best_effort };
+    let (first, second) =
+        (here.writer("crowd", best_effort).unwrap(), here.writer("crowd", best_effort).unwrap());
     let (arrived, arrivals) = sync_channel(64);
     let reader = |profile| {
         let arrived = arrived.clone();
@@ -46,10 +42,8 @@ async fn a_writer_finds_its_reader_behind_a_crowd_of_others() {
         .await;
     }
     drop((others, suits));
-    eventually("nobody is left", || {
-        (!first.is_matched() && !second.is_matched()).then_some(())
-    })
-    .await;
+    eventually("nobody is left", || (!first.is_matched() && !second.is_matched()).then_some(()))
+        .await;
 }
 
 /// Datagrams that look like announcements and cannot be decoded.
@@ -86,7 +80,5 @@ async fn forged_announcements_keep_no_newcomer_out() {
             }
         }
     };
-    tokio::time::timeout(DEADLINE, arrived)
-        .await
-        .expect("the newcomer is heard");
+    tokio::time::timeout(DEADLINE, arrived).await.expect("the newcomer is heard");
 }

@@ -14,14 +14,10 @@ use serde_json::Value;
 
 use super::support::{DEADLINE, Domain, eventually, frame};
 
-/// The longest time that others may receive nothing. Beyond it counts what was not sent, and what the machine had nobody do
-/// anything.
+/// The longest time that others may receive nothing. Beyond it counts what was not sent, and what
+/// the machine had nobody do anything.
 const LONGEST_GAP: Duration = Duration::from_millis(300);
-const RELIABLE: PublisherOptions = PublisherOptions {
-    depth: 0,
-    reliable: true,
-    large: false,
-};
+const RELIABLE: PublisherOptions = PublisherOptions { depth: 0, reliable: true, large: false };
 
 /// A reader in a process of its own.
 struct Peer {
@@ -34,10 +30,7 @@ impl Peer {
         let id = domain.id.to_string();
         let kind = name.split_once(' ').unwrap().0;
         let arguments = [&[kind, "--domain", &id, "--topic", topic.as_str()], more].concat();
-        Self {
-            process: Process::tool("dds-peer", &arguments, None).unwrap(),
-            name,
-        }
+        Self { process: Process::tool("dds-peer", &arguments, None).unwrap(), name }
     }
 
     fn signal(&self, signal: Signal) {
@@ -104,7 +97,13 @@ struct Source {
 }
 
 impl Source {
-    fn new(broker: &DdsBroker, topic: &ChannelName, hz: f64, bytes: usize, options: PublisherOptions) -> Self {
+    fn new(
+        broker: &DdsBroker,
+        topic: &ChannelName,
+        hz: f64,
+        bytes: usize,
+        options: PublisherOptions,
+    ) -> Self {
         Self {
             publisher: broker.publisher(topic, options).unwrap(),
             topic: topic.clone(),
@@ -160,21 +159,16 @@ fn topic(name: &str) -> ChannelName {
 async fn a_killed_reader_holds_nobody_up() {
     let domain = Domain::start();
     let broker = domain.open().await;
-    for (victim, large) in [
-        ("adapter victim", false),
-        ("plain victim", false),
-        ("adapter victim", true),
-    ] {
+    for (victim, large) in
+        [("adapter victim", false), ("plain victim", false), ("adapter victim", true)]
+    {
         let topic = topic(&format!("killed/{}-{large}", victim.replace(' ', "-")));
-        let flags: &[&str] = if large {
-            &["--reliable", "--large"]
-        } else {
-            &["--reliable"]
-        };
-        let [victim, one, other] =
-            [victim, "adapter witness", "plain witness"].map(|name| Peer::start(&domain, name, &topic, flags));
+        let flags: &[&str] = if large { &["--reliable", "--large"] } else { &["--reliable"] };
+        let [victim, one, other] = [victim, "adapter witness", "plain witness"]
+            .map(|name| Peer::start(&domain, name, &topic, flags));
         let options = PublisherOptions { large, ..RELIABLE };
-        // For large messages a writer has a window of 64, and a reader that is late keeps the last 32.
+        // For large messages a writer has a window of 64, and a reader that is late keeps the last
+        // 32.
         let (rate_hz, bytes) = if large { (200.0, 4_000) } else { (500.0, 200) };
         let mut source = Source::new(&broker, &topic, rate_hz, bytes, options);
         source.meet(&[&victim, &one, &other]).await;
@@ -211,9 +205,7 @@ async fn a_reader_that_stands_still_holds_nobody_up_and_comes_back() {
     victim.signal(Signal::CONT);
     let goal = source.sequence + 1;
     let until = Instant::now() + DEADLINE;
-    source
-        .until(|| victim.number("last") > goal || Instant::now() > until)
-        .await;
+    source.until(|| victim.number("last") > goal || Instant::now() > until).await;
     assert!(victim.number("last") > goal, "it receives again: {}", victim.report());
     one.has_all(&source).await;
     other.has_all(&source).await;
@@ -243,10 +235,7 @@ async fn large_messages_reach_a_plain_program() {
     let broker = domain.open().await;
     let topic = topic("large");
     let reader = Peer::start(&domain, "plain reader", &topic, &["--reliable"]);
-    let options = PublisherOptions {
-        large: true,
-        ..RELIABLE
-    };
+    let options = PublisherOptions { large: true, ..RELIABLE };
     let mut source = Source::new(&broker, &topic, 5.0, 1_000, options);
     source.meet(&[&reader]).await;
     source.bytes = 8_000_000;

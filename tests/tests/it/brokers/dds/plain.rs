@@ -1,4 +1,5 @@
-//! Writers that keep samples for late joiners, plain DDS programs among them, whose clocks nobody knows.
+//! Writers that keep samples for late joiners, plain DDS programs among them, whose clocks nobody
+//! knows.
 
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
@@ -28,19 +29,11 @@ async fn a_plain_program_whose_clock_is_an_hour_behind_is_heard() {
     const LIVE: usize = 10;
     let domain = Domain::start();
     let plain = Participant::start(ParticipantConfig::new(domain.id, Ipv4Addr::LOCALHOST)).unwrap();
-    let profile = Profile {
-        reliable: true,
-        depth: 4,
-        transient_local: true,
-        window: 1024,
-    };
+    let profile = Profile { reliable: true, depth: 4, transient_local: true, window: 1024 };
     let writer = plain.writer("bt/clock", profile).unwrap();
     let write = |octets: &'static [u8], seconds: i32| {
         let written = Timestamp::now() - rustdds::Duration::from_secs(3_600 + seconds);
-        assert_eq!(
-            writer.write_at(Bytes::from_static(octets), Some(written)),
-            Written::Taken
-        );
+        assert_eq!(writer.write_at(Bytes::from_static(octets), Some(written)), Written::Taken);
     };
     for seconds in [4, 3, 2, 1] {
         write(b"kept", seconds);
@@ -51,15 +44,11 @@ async fn a_plain_program_whose_clock_is_an_hour_behind_is_heard() {
     let mut late = broker.subscribe(&topic, WITH_KEPT).await.unwrap();
     let (mut by_volatile, mut by_late) = (Vec::new(), Vec::new());
     let until = Instant::now() + DEADLINE;
-    let count = |found: &[Received]| found.iter().filter(|received| text(received) == b"live").count();
+    let count =
+        |found: &[Received]| found.iter().filter(|received| text(received) == b"live").count();
     // A pause would end the wait for what is kept, so there is none.
     while count(&by_volatile) < LIVE || count(&by_late) < LIVE {
-        assert!(
-            Instant::now() < until,
-            "{} and {} came",
-            by_volatile.len(),
-            by_late.len()
-        );
+        assert!(Instant::now() < until, "{} and {} came", by_volatile.len(), by_late.len());
         write(b"live", 0);
         tokio::time::sleep(Duration::from_millis(20)).await;
         drain(&mut volatile, &mut by_volatile).await;
@@ -78,11 +67,7 @@ async fn a_late_joiner_gets_what_is_kept_though_another_topic_never_pauses() {
     let domain = Domain::start();
     let (speaker, listener) = (domain.open().await, domain.open().await);
     let (latched, busy) = ("latched".parse().unwrap(), "busy".parse().unwrap());
-    let keeps = PublisherOptions {
-        depth: 1,
-        reliable: true,
-        large: false,
-    };
+    let keeps = PublisherOptions { depth: 1, reliable: true, large: false };
     let keeper = speaker.publisher(&latched, keeps).unwrap();
     keeper.publish(&frame(&latched, 1, 1, 10), None);
     eventually("it is written", || (keeper.later().queued == 0).then_some(())).await;

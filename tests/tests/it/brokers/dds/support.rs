@@ -24,17 +24,11 @@ pub(super) struct Domain {
 
 impl Domain {
     pub(super) fn start() -> Self {
-        Self {
-            id: free_domain().unwrap(),
-            before: own_threads(),
-        }
+        Self { id: free_domain().unwrap(), before: own_threads() }
     }
 
     pub(super) fn section(&self) -> Section {
-        Section {
-            domain: self.id,
-            interface: Ipv4Addr::LOCALHOST,
-        }
+        Section { domain: self.id, interface: Ipv4Addr::LOCALHOST }
     }
 
     /// A participant that stands.
@@ -55,7 +49,8 @@ impl Fixture for Domain {
             clocks_apart: Duration::from_millis(30),
             queue_bytes: MAX_QUEUE_BYTES,
             channels: 100,
-            // A best-effort sample of more fragments is lost as a whole too often on a busy machine.
+            // A best-effort sample of more fragments is lost as a whole too often on a busy
+            // machine.
             largest_payload: 8_000_000,
             ..Capabilities::default()
         }

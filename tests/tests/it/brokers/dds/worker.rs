@@ -5,7 +5,9 @@ use std::net::Ipv4Addr;
 use std::sync::Arc;
 
 use blaze_brokers::dds::{Participant, ParticipantConfig, Profile};
-use blaze_brokers::{Broker as _, BrokerError, Content, KeyedMessage, SubscribeOptions, Subscription, WriteError};
+use blaze_brokers::{
+    Broker as _, BrokerError, Content, KeyedMessage, SubscribeOptions, Subscription, WriteError,
+};
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -28,7 +30,9 @@ async fn until(subscription: &mut Subscription, last: &str) -> Vec<String> {
         let received = tokio::time::timeout(DEADLINE, subscription.receive(&mut batch, 1)).await;
         assert_eq!(received, Ok(1), "after {texts:?}");
         match &batch[0].content {
-            Content::Bare { payload, .. } => texts.push(String::from_utf8(payload.to_vec()).unwrap()),
+            Content::Bare { payload, .. } => {
+                texts.push(String::from_utf8(payload.to_vec()).unwrap())
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -42,18 +46,12 @@ async fn whoever_comes_late_gets_the_last_notices_as_they_are() {
     let side = worker.worker_side().unwrap();
     let channel: ChannelName = "blaze/config/changed/slam".parse().unwrap();
     let unknown = side.write(&[said(&channel, "early")]).await;
-    assert!(
-        matches!(unknown, Err(WriteError::Broker(BrokerError::Name { .. }))),
-        "{unknown:?}"
-    );
+    assert!(matches!(unknown, Err(WriteError::Broker(BrokerError::Name { .. }))), "{unknown:?}");
     side.prepare(&channel).unwrap();
     let early = domain.open().await;
     let mut listening = early.subscribe(&channel, SubscribeOptions::default()).await.unwrap();
     side.write(&[said(&channel, "1"), said(&channel, "2")]).await.unwrap();
-    let away = KeyedMessage {
-        value: None,
-        ..said(&channel, "")
-    };
+    let away = KeyedMessage { value: None, ..said(&channel, "") };
     assert_eq!(side.write(&[away]).await, Ok(()), "there are no keys");
     assert_eq!(until(&mut listening, "2").await, ["1", "2"]);
 
@@ -62,12 +60,7 @@ async fn whoever_comes_late_gets_the_last_notices_as_they_are() {
     let mut kept = late.subscribe(&channel, WITH_KEPT).await.unwrap();
     assert_eq!(until(&mut kept, "2").await, ["1", "2"]);
     let plain = Participant::start(ParticipantConfig::new(domain.id, Ipv4Addr::LOCALHOST)).unwrap();
-    let profile = Profile {
-        reliable: true,
-        depth: 64,
-        transient_local: true,
-        window: 0,
-    };
+    let profile = Profile { reliable: true, depth: 64, transient_local: true, window: 0 };
     let heard = Arc::new(Mutex::new(BTreeSet::new()));
     let noted = Arc::clone(&heard);
     let sink = Box::new(move |_, octets: Bytes| {

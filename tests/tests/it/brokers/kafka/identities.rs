@@ -10,7 +10,10 @@ use blaze_tests::servers::unique_name;
 use sha2::{Digest as _, Sha256};
 
 use super::plain::{PlainProducer, delete_topic, make_topic, topic_uuid};
-use super::{Flow, WITH_KEPT, eventually, frame, health, open, publish, publisher, reader, start_server, subscribe};
+use super::{
+    Flow, WITH_KEPT, eventually, frame, health, open, publish, publisher, reader, start_server,
+    subscribe,
+};
 
 fn bare_writer(layer: &str, uuid: &str, partition: i32) -> WriterId {
     let hash = Sha256::digest(format!("kafka|{layer}|{uuid}|{partition}"));

@@ -11,10 +11,7 @@ async fn from(broker: &dyn Broker, channel: &ChannelName, begin: Begin) -> (Read
     let subscription = broker.subscribe_from(channel, SubscribeOptions::default(), begin).await;
     let subscription = subscription.unwrap();
     let starts = subscription.starts().to_vec();
-    let reader = Reader {
-        subscription,
-        waiting: Vec::new(),
-    };
+    let reader = Reader { subscription, waiting: Vec::new() };
     (reader, starts)
 }
 
@@ -56,26 +53,18 @@ async fn a_reader_begins_where_it_is_told_and_the_others_get_nothing_twice() {
     expect(&mut again, 4..=10).await;
     // By time, and no later than a bound.
     let appended_ms = places[5].appended_ms.unwrap();
-    let since = |latest: &[i64]| Begin::Since {
-        appended_ms,
-        latest: latest.into(),
-    };
+    let since = |latest: &[i64]| Begin::Since { appended_ms, latest: latest.into() };
     let (mut timed, starts) = from(&flow.broker, &channel, since(&[])).await;
     let start = usize::try_from(starts[0]).unwrap();
-    assert!(
-        start <= 5 && places[start].appended_ms >= Some(appended_ms),
-        "{starts:?} {places:?}"
-    );
+    assert!(start <= 5 && places[start].appended_ms >= Some(appended_ms), "{starts:?} {places:?}");
     expect(&mut timed, starts[0].unsigned_abs() + 1..=10).await;
     // All ten may have been appended in one millisecond; then the time leads to the first.
     let (mut bound, starts) = from(&flow.broker, &channel, since(&[2])).await;
     assert_eq!(starts, [start.min(2) as i64]);
     expect(&mut bound, start.min(2) as u64 + 1..=10).await;
     // After the last record a time is the end.
-    let later = Begin::Since {
-        appended_ms: places[9].appended_ms.unwrap() + 60_000,
-        latest: [].into(),
-    };
+    let later =
+        Begin::Since { appended_ms: places[9].appended_ms.unwrap() + 60_000, latest: [].into() };
     let (mut later, starts) = from(&flow.broker, &channel, later).await;
     assert_eq!(starts, [10]);
     // What the server does not have is moved to the nearest.
@@ -86,15 +75,9 @@ async fn a_reader_begins_where_it_is_told_and_the_others_get_nothing_twice() {
     expect(&mut before, 1..=10).await;
 
     publish(writer.as_ref(), &frame(&channel, 1, 11));
-    for reader in [
-        &mut first,
-        &mut again,
-        &mut timed,
-        &mut bound,
-        &mut later,
-        &mut beyond,
-        &mut before,
-    ] {
+    for reader in
+        [&mut first, &mut again, &mut timed, &mut bound, &mut later, &mut beyond, &mut before]
+    {
         expect(reader, 11..=11).await;
         assert!(reader.is_silent().await);
     }
@@ -115,9 +98,6 @@ async fn who_gets_what_is_kept_is_told_where_it_goes_on_too() {
     for (partition, offset) in [(2, 1), (1, 0), (0, 2)] {
         plain.write(&name, partition, &["live"]);
         let place = reader.next().await.place.unwrap();
-        assert_eq!(
-            (place.partition, place.offset),
-            (usize::try_from(partition).unwrap(), offset)
-        );
+        assert_eq!((place.partition, place.offset), (usize::try_from(partition).unwrap(), offset));
     }
 }

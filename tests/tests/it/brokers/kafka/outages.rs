@@ -62,12 +62,7 @@ async fn a_client_may_come_before_its_server_and_its_topic() {
     let channel = blaze_tests::servers::unique_name("early").parse().unwrap();
     let publisher = publisher(&service, &channel, 0);
     publish(publisher.as_ref(), &frame(&channel, 1, 1));
-    assert!(
-        service
-            .subscribe(&channel, blaze_brokers::SubscribeOptions::default())
-            .await
-            .is_err()
-    );
+    assert!(service.subscribe(&channel, blaze_brokers::SubscribeOptions::default()).await.is_err());
     server.restart().unwrap();
     health(&service, Health::Up).await;
     assert_eq!(publisher.later().queued, 1, "there is no such topic yet");

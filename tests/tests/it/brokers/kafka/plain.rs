@@ -25,13 +25,15 @@ fn admin(server: &KafkaServer) -> AdminClient<DefaultClientContext> {
     config(server).create().unwrap()
 }
 
-pub(crate) async fn make_topic(server: &KafkaServer, name: &str, partitions: i32, settings: &[(&str, &str)]) {
+pub(crate) async fn make_topic(
+    server: &KafkaServer,
+    name: &str,
+    partitions: i32,
+    settings: &[(&str, &str)],
+) {
     let topic = NewTopic::new(name, partitions, TopicReplication::Fixed(1));
     let topic = settings.iter().fold(topic, |topic, (key, value)| topic.set(key, value));
-    let made = admin(server)
-        .create_topics([&topic], &AdminOptions::new())
-        .await
-        .unwrap();
+    let made = admin(server).create_topics([&topic], &AdminOptions::new()).await.unwrap();
     assert_eq!(made, [Ok(name.to_owned())]);
 }
 
@@ -47,22 +49,16 @@ pub(crate) async fn topic_setting(server: &KafkaServer, topic: &str, name: &str)
 
 /// Whether the server has a topic.
 pub(crate) fn has_topic(bootstrap: &str, name: &str) -> bool {
-    let client: BaseConsumer = ClientConfig::new()
-        .set("bootstrap.servers", bootstrap)
-        .create()
-        .unwrap();
+    let client: BaseConsumer =
+        ClientConfig::new().set("bootstrap.servers", bootstrap).create().unwrap();
     let metadata = client.fetch_metadata(Some(name), TIMEOUT).unwrap();
-    metadata
-        .topics()
-        .iter()
-        .any(|topic| topic.name() == name && topic.error().is_none() && !topic.partitions().is_empty())
+    metadata.topics().iter().any(|topic| {
+        topic.name() == name && topic.error().is_none() && !topic.partitions().is_empty()
+    })
 }
 
 pub(crate) async fn delete_topic(server: &KafkaServer, name: &str) {
-    let deleted = admin(server)
-        .delete_topics(&[name], &AdminOptions::new())
-        .await
-        .unwrap();
+    let deleted = admin(server).delete_topics(&[name], &AdminOptions::new()).await.unwrap();
     assert_eq!(deleted, [Ok(name.to_owned())]);
 }
 
@@ -83,7 +79,8 @@ impl PlainProducer {
     }
 }
 
-/// The server's identity of a topic in Kafka's text form, asked of the server itself (metadata, version 12).
+/// The server's identity of a topic in Kafka's text form, asked of the server itself (metadata,
+/// version 12).
 pub(crate) fn topic_uuid(server: &KafkaServer, topic: &str) -> String {
     let mut body = vec![0, 3, 0, 12, 0, 0, 0, 9, 0xFF, 0xFF, 0];
     body.extend([2]); // one topic: without its identity, by name
@@ -93,18 +90,13 @@ pub(crate) fn topic_uuid(server: &KafkaServer, topic: &str) -> String {
     body.extend([0, 0, 0, 0]);
     let mut stream = TcpStream::connect(server.bootstrap()).unwrap();
     stream.set_read_timeout(Some(TIMEOUT)).unwrap();
-    stream
-        .write_all(&u32::try_from(body.len()).unwrap().to_be_bytes())
-        .unwrap();
+    stream.write_all(&u32::try_from(body.len()).unwrap().to_be_bytes()).unwrap();
     stream.write_all(&body).unwrap();
     let mut length = [0; 4];
     stream.read_exact(&mut length).unwrap();
     let mut answer = vec![0; u32::from_be_bytes(length) as usize];
     stream.read_exact(&mut answer).unwrap();
     // The identity follows the topic's name.
-    let name = answer
-        .windows(topic.len())
-        .position(|window| window == topic.as_bytes())
-        .unwrap();
+    let name = answer.windows(topic.len()).position(|window| window == topic.as_bytes()).unwrap();
     URL_SAFE_NO_PAD.encode(&answer[name + topic.len()..][..16])
 }

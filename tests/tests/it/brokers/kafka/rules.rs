@@ -20,7 +20,8 @@ struct Kafka {
 /// Threads of the adapter, and the main one of each client of the client library.
 fn threads() -> Vec<String> {
     let tasks = std::fs::read_dir("/proc/self/task").unwrap();
-    let names = tasks.filter_map(|task| std::fs::read_to_string(task.ok()?.path().join("comm")).ok());
+    let names =
+        tasks.filter_map(|task| std::fs::read_to_string(task.ok()?.path().join("comm")).ok());
     let mut names: Vec<String> = names
         .map(|name| name.trim().to_owned())
         .filter(|name| name == "rdk:main" || name.starts_with("kafka-"))
@@ -73,11 +74,7 @@ async fn kafka_follows_the_rules() {
     let server = start_server();
     eventually("the clients of other tests are gone", async || threads().is_empty()).await;
     let flow = Flow::open(&server).await;
-    let fixture = Kafka {
-        server,
-        flow,
-        threads_of_flow: threads(),
-    };
+    let fixture = Kafka { server, flow, threads_of_flow: threads() };
     let failures = run_all(&fixture).await;
     assert!(failures.is_empty(), "{failures:#?}");
 }

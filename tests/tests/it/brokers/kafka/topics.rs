@@ -9,7 +9,9 @@ use blaze_tests::servers::unique_name;
 use bytes::Bytes;
 
 use super::plain::{delete_topic, make_topic, topic_uuid};
-use super::{Flow, WITH_KEPT, eventually, frame, health, publish, publisher, reader, start_server, subscribe};
+use super::{
+    Flow, WITH_KEPT, eventually, frame, health, publish, publisher, reader, start_server, subscribe,
+};
 
 async fn leases(side: &dyn FlowSide) -> BTreeMap<String, String> {
     let loaded = side.load_leases().await.unwrap();
@@ -18,10 +20,7 @@ async fn leases(side: &dyn FlowSide) -> BTreeMap<String, String> {
 }
 
 fn map(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
-    pairs
-        .iter()
-        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-        .collect()
+    pairs.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -34,10 +33,7 @@ async fn leases_survive_the_flow_the_server_and_their_topic() {
     }
     flow.side.remove_lease("c");
     let expected = map(&[("a", "3"), ("b", "2")]);
-    eventually("the leases are there", async || {
-        leases(flow.side.as_ref()).await == expected
-    })
-    .await;
+    eventually("the leases are there", async || leases(flow.side.as_ref()).await == expected).await;
     server.kill().unwrap();
     health(&flow.broker, Health::Down).await;
     assert!(matches!(flow.side.load_leases().await, Err(BrokerError::Away(_))));
@@ -137,18 +133,14 @@ async fn a_flow_that_stands_back_reads_and_writes_nothing_but_where_flows_meet()
     let peers: ChannelName = "blaze/flow/peers".parse().unwrap();
     let mut reader_of_user = reader(&flow.broker, &channel).await;
     let mut reader_of_peers = reader(&flow.broker, &peers).await;
-    let (user, meeting) = (publisher(&flow.broker, &channel, 0), publisher(&flow.broker, &peers, 0));
+    let (user, meeting) =
+        (publisher(&flow.broker, &channel, 0), publisher(&flow.broker, &peers, 0));
     let others = publisher(&other.broker, &channel, 0);
     flow.side.stand_back(Some("cloud/server-9".to_owned()));
     health(&flow.broker, Health::InUse).await;
     assert_eq!(flow.broker.status().borrow().detail, "scope_in_use: cloud/server-9");
     assert_eq!(user.publish(&frame(&channel, 1, 1), None), PublishOutcome::Dropped);
-    assert!(
-        flow.broker
-            .subscribe(&channel, SubscribeOptions::default())
-            .await
-            .is_err()
-    );
+    assert!(flow.broker.subscribe(&channel, SubscribeOptions::default()).await.is_err());
     publish(others.as_ref(), &frame(&channel, 2, 1));
     let hello = Bytes::from_static(b"hello");
     assert_eq!(meeting.publish_bare(&hello, None), PublishOutcome::Taken);

@@ -3,14 +3,19 @@
 use std::sync::Arc;
 
 use blaze_brokers::kafka::KafkaBroker;
-use blaze_brokers::{Broker as _, BrokerError, Health, KeyedMessage, PublisherOptions, Role, WorkerSide, WriteError};
+use blaze_brokers::{
+    Broker as _, BrokerError, Health, KeyedMessage, PublisherOptions, Role, WorkerSide, WriteError,
+};
 use blaze_domain::names::ChannelName;
 use blaze_tests::plain::{KafkaReader, Record};
 use blaze_tests::servers::KafkaServer;
 use bytes::Bytes;
 
 use super::plain::{delete_topic, has_topic, make_topic, topic_setting, topic_uuid};
-use super::{DEADLINE, Flow, Reader, WITH_KEPT, eventually, health, open, reader, section, start_server, subscribe};
+use super::{
+    DEADLINE, Flow, Reader, WITH_KEPT, eventually, health, open, reader, section, start_server,
+    subscribe,
+};
 
 struct Worker {
     broker: KafkaBroker,
@@ -49,10 +54,7 @@ fn said(service: &str, key: &str, value: &'static str) -> KeyedMessage {
 }
 
 fn taken_away(service: &str, key: &str) -> KeyedMessage {
-    KeyedMessage {
-        value: None,
-        ..said(service, key, "")
-    }
+    KeyedMessage { value: None, ..said(service, key, "") }
 }
 
 async fn texts(reader: &mut Reader, count: usize) -> Vec<String> {
@@ -71,10 +73,7 @@ async fn a_worker_makes_its_topics_beside_a_flow_and_neither_disturbs_the_other(
     for topic in ["blaze.config.get", "blaze.config.ack", "blaze.reply", "blaze.watchdog"] {
         assert!(has_topic(&server.bootstrap(), topic), "{topic}");
     }
-    assert!(
-        !has_topic(&server.bootstrap(), "blaze.flow.control"),
-        "it is the flow's"
-    );
+    assert!(!has_topic(&server.bootstrap(), "blaze.flow.control"), "it is the flow's");
     assert!(worker.broker.flow_side().is_none());
     worker.side.prepare(&channel("slam")).unwrap();
     let flow = Flow::open(&server).await;
@@ -84,10 +83,8 @@ async fn a_worker_makes_its_topics_beside_a_flow_and_neither_disturbs_the_other(
     worker.write(&[said("slam", "0", "{}")]).await;
     // Both read and write the one topic that both make, and others' topics do not matter to them.
     let mut replies = reader(&flow.broker, &ChannelName::shared_reply()).await;
-    let by_worker = worker
-        .broker
-        .publisher(&ChannelName::shared_reply(), PublisherOptions::default())
-        .unwrap();
+    let by_worker =
+        worker.broker.publisher(&ChannelName::shared_reply(), PublisherOptions::default()).unwrap();
     by_worker.publish_bare(&Bytes::from_static(br#"{"id":"7"}"#), None);
     assert_eq!(texts(&mut replies, 1).await, [r#"{"id":"7"}"#]);
     assert!(has_topic(&server.bootstrap(), user.as_str()));
@@ -107,15 +104,9 @@ async fn the_last_notice_of_each_key_stays_and_plain_clients_see_it_as_it_is() {
     worker.side.prepare(&channel("slam")).unwrap();
     let mut early = reader(&client, &channel("slam")).await;
     let long = "0197c1d27f3a7b649c1e2f6f0a4e8d11";
-    worker
-        .write(&[said("slam", "", r#"{"n":1}"#), said("slam", "0", r#"{"n":2}"#)])
-        .await;
-    worker
-        .write(&[said("slam", long, r#"{"n":3}"#), said("slam", "0", r#"{"n":4}"#)])
-        .await;
-    worker
-        .write(&[said("slam", "9", r#"{"n":5}"#), taken_away("slam", "9")])
-        .await;
+    worker.write(&[said("slam", "", r#"{"n":1}"#), said("slam", "0", r#"{"n":2}"#)]).await;
+    worker.write(&[said("slam", long, r#"{"n":3}"#), said("slam", "0", r#"{"n":4}"#)]).await;
+    worker.write(&[said("slam", "9", r#"{"n":5}"#), taken_away("slam", "9")]).await;
     let all: Vec<String> = (1..=5).map(|number| format!(r#"{{"n":{number}}}"#)).collect();
     assert_eq!(texts(&mut early, 5).await, all);
     assert!(early.is_silent().await, "taking away is no message");
@@ -127,10 +118,7 @@ async fn the_last_notice_of_each_key_stays_and_plain_clients_see_it_as_it_is() {
     assert_eq!(topic_setting(&server, topic, "cleanup.policy").await, "compact");
     let plain = KafkaReader::from_beginning(&server.bootstrap(), topic).unwrap();
     let records: Vec<Record> = (0..6).map(|_| plain.next(DEADLINE).unwrap()).collect();
-    let keys: Vec<_> = records
-        .iter()
-        .map(|record| String::from_utf8_lossy(&record.key))
-        .collect();
+    let keys: Vec<_> = records.iter().map(|record| String::from_utf8_lossy(&record.key)).collect();
     assert_eq!(keys, ["", "0", long, "0", "9", "9"]);
     assert_eq!(records[0].text(), r#"{"n":1}"#, "pure JSON");
     assert!(records.iter().all(|record| record.headers.is_empty()));
@@ -148,18 +136,11 @@ async fn a_topic_that_vanishes_is_made_again_and_one_that_cannot_be_made_holds_u
         worker.side.write(&[said("slam", "0", "early")]).await,
         Err(WriteError::Broker(BrokerError::Name { .. }))
     ));
-    assert_eq!(
-        worker.side.write(&[taken_away("slam", "0")]).await,
-        Ok(()),
-        "nothing is there"
-    );
+    assert_eq!(worker.side.write(&[taken_away("slam", "0")]).await, Ok(()), "nothing is there");
     for service in ["slam", "old"] {
         worker.side.prepare(&channel(service)).unwrap();
     }
-    assert!(matches!(
-        worker.side.prepare(&channel("nav")),
-        Err(BrokerError::Collision { .. })
-    ));
+    assert!(matches!(worker.side.prepare(&channel("nav")), Err(BrokerError::Collision { .. })));
     worker.write(&[said("slam", "0", "1"), said("old", "0", "1")]).await;
     eventually("a topic that was there keeps the last values from now on", async || {
         topic_setting(&server, "blaze.config.changed.old", "cleanup.policy").await == "compact"
@@ -173,10 +154,7 @@ async fn a_topic_that_vanishes_is_made_again_and_one_that_cannot_be_made_holds_u
         ..said("slam", "0", "")
     };
     let refused = worker.side.write(&[large]).await;
-    assert!(
-        matches!(refused, Err(WriteError::TooLarge { bytes: 3_145_728, .. })),
-        "{refused:?}"
-    );
+    assert!(matches!(refused, Err(WriteError::TooLarge { bytes: 3_145_728, .. })), "{refused:?}");
     let mut slam = reader(&worker.broker, &channel("slam")).await;
     let first = topic_uuid(&server, "blaze.config.changed.slam");
     delete_topic(&server, "blaze.config.changed.slam").await;
@@ -207,10 +185,7 @@ async fn what_a_killed_server_did_not_acknowledge_is_not_taken_for_written() {
     worker.write(&[said("slam", "0", "1")]).await;
     server.kill().unwrap();
     let refused = worker.side.write(&[said("slam", "0", "2")]).await;
-    assert!(
-        matches!(refused, Err(WriteError::Broker(BrokerError::Away(_)))),
-        "{refused:?}"
-    );
+    assert!(matches!(refused, Err(WriteError::Broker(BrokerError::Away(_)))), "{refused:?}");
     health(&worker.broker, Health::Down).await;
     assert!(worker.side.write(&[said("slam", "0", "3")]).await.is_err());
     server.restart().unwrap();

@@ -5,12 +5,12 @@ use blaze_brokers::{Broker, BrokerError, Health, OpenError, Role, SubscribeOptio
 use blaze_tests::servers::{RedisKind, RedisOptions};
 use serde_json::json;
 
-use super::support::{Server, channel, next_number, publish, publisher, section_of, settled, subscribe, wait_for};
+use super::support::{
+    Server, channel, next_number, publish, publisher, section_of, settled, subscribe, wait_for,
+};
 
-const USERS: [&str; 2] = [
-    "default on >master ~* &* +@all",
-    "edge on >hunter2 ~b:* &b:* +@all -@dangerous",
-];
+const USERS: [&str; 2] =
+    ["default on >master ~* &* +@all", "edge on >hunter2 ~b:* &b:* +@all -@dangerous"];
 
 fn with_users() -> Server {
     Server::with(
@@ -26,18 +26,21 @@ fn open(section: &serde_json::Value, role: &Role) -> Result<RedisBroker, OpenErr
     RedisBroker::open(&section_of(section), role)
 }
 
-/// A user with few rights does all that a flow and a service do; foreign channels are refused by name.
+/// A user with few rights does all that a flow and a service do; foreign channels are refused by
+/// name.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_user_of_the_access_list_is_enough() {
     let server = with_users();
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("password");
     std::fs::write(&file, "hunter2\n").unwrap();
-    let mut section = json!({ "url": server.server.url(), "user": "edge", "password_file": file, "prefix": "b:" });
-    let role = Role::Flow {
-        flow: "edge/robot-1".parse().unwrap(),
-        epoch: 1,
-    };
+    let mut section = json!({
+        "url": server.server.url(),
+        "user": "edge",
+        "password_file": file,
+        "prefix": "b:",
+    });
+    let role = Role::Flow { flow: "edge/robot-1".parse().unwrap(), epoch: 1 };
     let flow = open(&section, &role).unwrap();
     assert_eq!(wait_for(&flow, Health::Up).await, "redis (version not told)");
     let mut reader = subscribe(&flow, "imu").await;
@@ -53,10 +56,7 @@ async fn a_user_of_the_access_list_is_enough() {
     let Err(BrokerError::Name { channel, reason }) = refused else {
         panic!("it may not be read");
     };
-    assert!(
-        channel == "c:imu" && reason.to_uppercase().contains("PERM"),
-        "{channel}: {reason}"
-    );
+    assert!(channel == "c:imu" && reason.to_uppercase().contains("PERM"), "{channel}: {reason}");
 }
 
 /// A refused login is told in the server's words, without the password.
@@ -79,13 +79,8 @@ async fn tls_is_spoken_and_checked() {
     use blaze_brokers::open_node;
     use blaze_domain::node_file::NodeBroker;
 
-    let server = Server::with(
-        RedisKind::Redis,
-        RedisOptions {
-            tls: true,
-            ..RedisOptions::default()
-        },
-    );
+    let server =
+        Server::with(RedisKind::Redis, RedisOptions { tls: true, ..RedisOptions::default() });
     let authority = server.server.authority().unwrap();
     for url in [server.server.url(), server.server.url().replace("rediss:", "redis:")] {
         let section = section_of(&json!({ "url": url, "tls": { "ca_file": authority } }));
@@ -117,11 +112,9 @@ async fn a_unix_socket_is_as_good() {
             ..RedisOptions::default()
         },
     );
-    let broker = open(
-        &json!({ "url": format!("redis+unix://{}", socket.display()) }),
-        &Role::Service,
-    )
-    .unwrap();
+    let broker =
+        open(&json!({ "url": format!("redis+unix://{}", socket.display()) }), &Role::Service)
+            .unwrap();
     wait_for(&broker, Health::Up).await;
     let mut reader = subscribe(&broker, "imu").await;
     publish(publisher(&broker, "imu", 0).as_ref(), 1, 1);

@@ -4,11 +4,12 @@ use blaze_brokers::{Broker, Content, Health};
 use blaze_tests::servers::RedisKind;
 
 use super::support::{
-    Server, channel, eventually, frame, next, next_number, publish, publisher, settled, subscribe_with_kept, wait_for,
-    writer,
+    Server, channel, eventually, frame, next, next_number, publish, publisher, settled,
+    subscribe_with_kept, wait_for, writer,
 };
 
-/// Late joiners come while a writer publishes as fast as it can: each gets an unbroken row, nothing twice.
+/// Late joiners come while a writer publishes as fast as it can: each gets an unbroken row, nothing
+/// twice.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn late_joiners_get_an_unbroken_row() {
     let server = Server::start(RedisKind::Redis);
@@ -29,18 +30,15 @@ async fn late_joiners_get_an_unbroken_row() {
         let mut late = subscribe_with_kept(&sink, "map").await;
         let (_, first) = next_number(&mut late).await;
         for expected in first + 1..first + 100 {
-            assert_eq!(
-                next_number(&mut late).await,
-                (1, expected),
-                "round {round}, from {first}"
-            );
+            assert_eq!(next_number(&mut late).await, (1, expected), "round {round}, from {first}");
         }
     }
     drop(stop);
     assert_eq!(thread.join().unwrap(), 0);
 }
 
-/// When a writer's lease has lapsed, its field goes; so it does not come back when the server loses everything.
+/// When a writer's lease has lapsed, its field goes; so it does not come back when the server loses
+/// everything.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_forgotten_writer_stays_forgotten() {
     let server = Server::start(RedisKind::Redis);
@@ -76,7 +74,8 @@ async fn a_forgotten_writer_stays_forgotten() {
     }
 }
 
-/// A service whose server was restarted writes again what it kept; what its gone publishers kept is forgotten.
+/// A service whose server was restarted writes again what it kept; what its gone publishers kept is
+/// forgotten.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_restarted_server_gets_back_what_a_service_keeps() {
     let server = Server::start(RedisKind::Redis);

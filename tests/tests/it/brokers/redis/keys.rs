@@ -20,10 +20,7 @@ fn keys_of(server: &Server) -> RedisKeys {
 }
 
 fn put(key: &str, value: &'static str) -> KeyChange {
-    KeyChange::Put {
-        key: key.to_owned(),
-        value: Bytes::from(value),
-    }
+    KeyChange::Put { key: key.to_owned(), value: Bytes::from(value) }
 }
 
 fn record(key: &str, state: &str, expires: Duration) -> KeyChange {
@@ -62,17 +59,10 @@ async fn a_record_vanishes_unless_it_is_renewed_and_only_those_asked_for_are_fou
     assert_eq!(found.len(), 2, "{found:?}");
     assert_eq!(found[0].0, "blaze:watchdog:slam:robot-1:0");
     assert_eq!(found[0].1["state"], "ready");
-    until(
-        async || keys.record("blaze:watchdog:slam:robot-1:1").await.unwrap(),
-        Option::is_none,
-    )
-    .await;
+    until(async || keys.record("blaze:watchdog:slam:robot-1:1").await.unwrap(), Option::is_none)
+        .await;
     assert_eq!(keys.records("blaze:watchdog:", 100).await.unwrap().len(), 1);
-    assert_eq!(
-        keys.records("blaze:", 1).await.unwrap().len(),
-        1,
-        "no more than asked for"
-    );
+    assert_eq!(keys.records("blaze:", 1).await.unwrap().len(), 1, "no more than asked for");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -80,14 +70,10 @@ async fn a_value_for_a_while_vanishes_and_a_new_one_takes_its_place_and_time() {
     let server = Server::start(RedisKind::Redis);
     let keys = keys_of(&server);
     keys.put_for("cache:a", &Bytes::from("1"), LONG).await.unwrap();
-    keys.put_for("cache:b", &Bytes::from_static(b"\x00\xff"), LONG)
-        .await
-        .unwrap();
+    keys.put_for("cache:b", &Bytes::from_static(b"\x00\xff"), LONG).await.unwrap();
     keys.put_for("cache:a", &Bytes::from("2"), SHORT).await.unwrap();
     // Less than the server can count is as short as it can be, and no error.
-    keys.put_for("cache:c", &Bytes::from("3"), Duration::ZERO)
-        .await
-        .unwrap();
+    keys.put_for("cache:c", &Bytes::from("3"), Duration::ZERO).await.unwrap();
     for gone in ["cache:a", "cache:c"] {
         until(async || keys.get(gone).await.unwrap(), Option::is_none).await;
     }
@@ -99,10 +85,7 @@ async fn a_value_for_a_while_vanishes_and_a_new_one_takes_its_place_and_time() {
 }
 
 fn lock(owner: &str) -> RedisLock {
-    RedisLock {
-        key: "blaze:lease:worker:fog".to_owned(),
-        owner: owner.to_owned(),
-    }
+    RedisLock { key: "blaze:lease:worker:fog".to_owned(), owner: owner.to_owned() }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -120,15 +103,9 @@ async fn what_counts_only_while_a_lock_is_held_is_done_wholly_or_not_at_all() {
     let mut batch = Vec::new();
     reader.receive(&mut batch, 10).await;
     assert_eq!(batch.len(), 1, "it comes with the change");
-    assert!(
-        !keys.apply_if_held(&one, &changes, &notice).await.unwrap(),
-        "nobody has it"
-    );
+    assert!(!keys.apply_if_held(&one, &changes, &notice).await.unwrap(), "nobody has it");
     keys.hold(&other, LONG, None).await.unwrap();
-    assert!(
-        !keys.apply_if_held(&one, &changes, &notice).await.unwrap(),
-        "another one has it"
-    );
+    assert!(!keys.apply_if_held(&one, &changes, &notice).await.unwrap(), "another one has it");
     assert_eq!(keys.get("a").await.unwrap(), None);
     assert_eq!(keys.get("c").await.unwrap(), Some(Bytes::from("0")));
     assert!(keys.apply_if_held(&other, &changes, &notice).await.unwrap());
@@ -163,9 +140,7 @@ async fn a_server_that_was_away_is_used_again_and_known_to_be_another() {
     let done = until(async || keys.apply(&[put("a", "3")], &[]).await, Result::is_ok).await;
     assert_eq!(done, Ok(()));
     assert_eq!(keys.get("a").await.unwrap(), Some(Bytes::from("3")));
-    tokio::time::timeout(Duration::from_secs(20), keys.restarted())
-        .await
-        .unwrap();
+    tokio::time::timeout(Duration::from_secs(20), keys.restarted()).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -174,10 +149,7 @@ async fn what_a_server_cannot_do_just_now_is_no_refusal() {
     let keys = keys_of(&server);
     let change = [put("a", "1")];
     keys.apply(&change, &[]).await.unwrap();
-    let lock = RedisLock {
-        key: "lease".to_owned(),
-        owner: "w-1".to_owned(),
-    };
+    let lock = RedisLock { key: "lease".to_owned(), owner: "w-1".to_owned() };
     assert!(keys.hold(&lock, LONG, None).await.unwrap().is_held);
     server.cli(&["CONFIG", "SET", "maxmemory", "1"]);
     for told in [

@@ -1,4 +1,5 @@
-//! The Redis adapter, on Redis and on Valkey: the rules for all adapters, and what is special to a server like this.
+//! The Redis adapter, on Redis and on Valkey: the rules for all adapters, and what is special to a
+//! server like this.
 
 mod access;
 mod kept;

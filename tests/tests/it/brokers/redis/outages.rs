@@ -2,15 +2,18 @@
 
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, BrokerError, Health, PublishOutcome, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{
+    Broker, BrokerError, Health, PublishOutcome, PublisherOptions, SubscribeOptions,
+};
 use blaze_tests::servers::{RedisKind, RedisOptions};
 
 use super::support::{
-    DEADLINE, Server, channel, eventually, frame, next_number, numbers_until_silence, publish, publisher, subscribe,
-    wait_for,
+    DEADLINE, Server, channel, eventually, frame, next_number, numbers_until_silence, publish,
+    publisher, subscribe, wait_for,
 };
 
-/// A frozen server: within some 2 s the client is down and takes nothing; thawed, it is up, and nothing comes twice.
+/// A frozen server: within some 2 s the client is down and takes nothing; thawed, it is up, and
+/// nothing comes twice.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
     for kind in [RedisKind::Redis, RedisKind::Valkey] {
@@ -49,10 +52,7 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
         // Up to the end of the freeze nothing is taken.
         while frozen.elapsed() < Duration::from_secs(5) {
             sequence += 1;
-            assert_eq!(
-                publisher.publish(&frame(1, sequence, 100), None),
-                PublishOutcome::Dropped
-            );
+            assert_eq!(publisher.publish(&frame(1, sequence, 100), None), PublishOutcome::Dropped);
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
         server.server.thaw().unwrap();
@@ -67,10 +67,8 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
         found.extend(numbers_until_silence(&mut reader).await);
         assert_eq!(found.last(), Some(&after));
         assert!(found.is_sorted_by(|a, b| a < b), "{found:?}");
-        let late: Vec<_> = found
-            .iter()
-            .filter(|&&number| number != after && !taken.contains(&number))
-            .collect();
+        let late: Vec<_> =
+            found.iter().filter(|&&number| number != after && !taken.contains(&number)).collect();
         assert!(late.is_empty(), "dropped and delivered: {late:?}");
         let later = publisher.later();
         let delivered = found.len() as u64 - 1;
@@ -83,7 +81,8 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
     }
 }
 
-/// A server that is killed while much is under way: what is not delivered is counted, nothing comes twice.
+/// A server that is killed while much is under way: what is not delivered is counted, nothing comes
+/// twice.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_killed_server_loses_nothing_uncounted() {
     let server = Server::start(RedisKind::Redis);
@@ -93,7 +92,9 @@ async fn a_killed_server_loses_nothing_uncounted() {
         let before = publisher.later();
         let mut taken = 0;
         for sequence in 1..=20_000 {
-            if publisher.publish(&frame(1, round * 100_000 + sequence, 1_000), None) == PublishOutcome::Taken {
+            if publisher.publish(&frame(1, round * 100_000 + sequence, 1_000), None)
+                == PublishOutcome::Taken
+            {
                 taken += 1;
             }
             if sequence == 10_000 {
@@ -116,8 +117,8 @@ async fn a_killed_server_loses_nothing_uncounted() {
     }
 }
 
-/// A reader that the server cuts off for being slow comes back by itself; what is missing is missing, nothing is repeated,
-/// and the status tells.
+/// A reader that the server cuts off for being slow comes back by itself; what is missing is
+/// missing, nothing is repeated, and the status tells.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_reader_that_is_cut_off_comes_back() {
     let server = Server::with(
@@ -128,24 +129,20 @@ async fn a_reader_that_is_cut_off_comes_back() {
         },
     );
     let (source, sink) = (server.service().await, server.service().await);
-    let options = SubscribeOptions {
-        large: true,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { large: true, ..SubscribeOptions::default() };
     let mut reader = sink.subscribe(&channel("camera"), options).await.unwrap();
-    let large = PublisherOptions {
-        large: true,
-        ..PublisherOptions::default()
-    };
+    let large = PublisherOptions { large: true, ..PublisherOptions::default() };
     let publisher = source.publisher(&channel("camera"), large).unwrap();
     // One message above the limit and above what the sockets hold: the server closes the reader.
     eventually("the large connection takes messages", || {
-        (publisher.publish(&frame(1, 1, 16 * 1024 * 1024), None) == PublishOutcome::Taken).then_some(())
+        (publisher.publish(&frame(1, 1, 16 * 1024 * 1024), None) == PublishOutcome::Taken)
+            .then_some(())
     })
     .await;
     let detail = eventually("the status tells", || {
         let status = sink.status().borrow().clone();
-        (status.health == Health::Up && status.detail.contains("interrupted")).then_some(status.detail)
+        (status.health == Health::Up && status.detail.contains("interrupted"))
+            .then_some(status.detail)
     })
     .await;
     assert!(detail.starts_with("redis 7.0.15; reading was interrupted"), "{detail}");

@@ -7,8 +7,8 @@ use blaze_tests::servers::RedisKind;
 use bytes::Bytes;
 
 use super::support::{
-    Server, channel, eventually, frame, next_number, numbers_until_silence, publish, publisher, settled, subscribe,
-    wait_for,
+    Server, channel, eventually, frame, next_number, numbers_until_silence, publish, publisher,
+    settled, subscribe, wait_for,
 };
 
 fn owner(server: &Server) -> String {
@@ -18,19 +18,14 @@ fn owner(server: &Server) -> String {
 fn leases(server: &Server) -> Vec<(String, String)> {
     let text = server.cli(&["HGETALL", "blaze:flow:leases"]);
     let lines: Vec<&str> = text.lines().filter(|line| !line.is_empty()).collect();
-    let mut found: Vec<_> = lines
-        .chunks(2)
-        .map(|pair| (pair[0].to_owned(), pair[1].to_owned()))
-        .collect();
+    let mut found: Vec<_> =
+        lines.chunks(2).map(|pair| (pair[0].to_owned(), pair[1].to_owned())).collect();
     found.sort();
     found
 }
 
 fn pairs(pairs: &[(&str, &str)]) -> Vec<(String, String)> {
-    pairs
-        .iter()
-        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-        .collect()
+    pairs.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
 }
 
 /// The first flow has the scope; another neither reads nor writes until the first has gone.
@@ -42,10 +37,7 @@ async fn a_scope_has_one_flow() {
         wait_for(&first, Health::Up).await;
         assert_eq!(owner(&server), "edge/robot-1/7");
         let second = server.flow("edge/robot-2", 9);
-        assert_eq!(
-            wait_for(&second, Health::InUse).await,
-            "scope_in_use: edge/robot-1 holds it"
-        );
+        assert_eq!(wait_for(&second, Health::InUse).await, "scope_in_use: edge/robot-1 holds it");
         let waiting = publisher(&second, "imu", 0);
         assert_eq!(waiting.publish(&frame(2, 1, 10), None), PublishOutcome::Dropped);
         let refused = second.subscribe(&channel("imu"), SubscribeOptions::default()).await;
@@ -54,10 +46,7 @@ async fn a_scope_has_one_flow() {
         first.close().await;
         let closed = Instant::now();
         wait_for(&second, Health::Up).await;
-        assert!(
-            closed.elapsed() < Duration::from_secs(3),
-            "a closed flow leaves no key behind"
-        );
+        assert!(closed.elapsed() < Duration::from_secs(3), "a closed flow leaves no key behind");
         assert_eq!(owner(&server), "edge/robot-2/9");
         let mut reader = subscribe(&second, "imu").await;
         publish(waiting.as_ref(), 2, 2);
@@ -84,10 +73,7 @@ async fn a_newer_life_takes_over() {
     let new_publisher = publisher(&new, "imu", 0);
     publish(new_publisher.as_ref(), 2, 1);
     settled(new_publisher.as_ref()).await;
-    assert!(
-        numbers_until_silence(&mut reader).await.is_empty(),
-        "the old life reads nothing"
-    );
+    assert!(numbers_until_silence(&mut reader).await.is_empty(), "the old life reads nothing");
     new.close().await;
     wait_for(&old, Health::Up).await;
     publish(old_publisher.as_ref(), 1, 2);
@@ -106,13 +92,11 @@ async fn a_dead_flow_is_succeeded() {
     let died = Instant::now();
     wait_for(&second, Health::Up).await;
     let passed = died.elapsed();
-    assert!(
-        passed > Duration::from_secs(3) && passed < Duration::from_secs(8),
-        "{passed:?}"
-    );
+    assert!(passed > Duration::from_secs(3) && passed < Duration::from_secs(8), "{passed:?}");
 }
 
-/// A flow whose server is frozen stops before its key has run out, and is the owner again afterwards.
+/// A flow whose server is frozen stops before its key has run out, and is the owner again
+/// afterwards.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_frozen_server_costs_the_scope_only_for_the_time() {
     let server = Server::start(RedisKind::Redis);
@@ -133,7 +117,8 @@ async fn a_frozen_server_costs_the_scope_only_for_the_time() {
     .await;
 }
 
-/// Leases are written in order, survive the flow, and come back after the server has lost everything.
+/// Leases are written in order, survive the flow, and come back after the server has lost
+/// everything.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn leases_survive_flow_and_server() {
     for kind in [RedisKind::Redis, RedisKind::Valkey] {

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use blaze_brokers::redis::{MAX_QUEUE_BYTES, RedisBroker};
 use blaze_brokers::{
-    Broker, Content, Health, PublishOutcome, Publisher, PublisherOptions, Received, Role, SubscribeOptions,
-    Subscription,
+    Broker, Content, Health, PublishOutcome, Publisher, PublisherOptions, Received, Role,
+    SubscribeOptions, Subscription,
 };
 use blaze_conformance::broker::{Capabilities, Fixture};
 use blaze_domain::names::ChannelName;
@@ -32,9 +32,7 @@ impl Server {
     }
 
     pub(super) fn with(kind: RedisKind, options: RedisOptions) -> Self {
-        Self {
-            server: RedisServer::start(kind, options).unwrap(),
-        }
+        Self { server: RedisServer::start(kind, options).unwrap() }
     }
 
     pub(super) fn section(&self) -> Section {
@@ -50,10 +48,7 @@ impl Server {
 
     /// A flow's client; it need not own the scope yet.
     pub(super) fn flow(&self, flow: &str, epoch: u64) -> RedisBroker {
-        let role = Role::Flow {
-            flow: flow.parse().unwrap(),
-            epoch,
-        };
+        let role = Role::Flow { flow: flow.parse().unwrap(), epoch };
         RedisBroker::open(&self.section(), &role).unwrap()
     }
 
@@ -71,11 +66,7 @@ impl Server {
 #[async_trait]
 impl Fixture for Server {
     fn capabilities(&self) -> Capabilities {
-        Capabilities {
-            queue_bytes: MAX_QUEUE_BYTES,
-            channels: 2_000,
-            ..Capabilities::default()
-        }
+        Capabilities { queue_bytes: MAX_QUEUE_BYTES, channels: 2_000, ..Capabilities::default() }
     }
 
     async fn broker(&self) -> Result<Arc<dyn Broker>, String> {
@@ -133,19 +124,13 @@ pub(super) fn frame(number: u8, sequence: u64, bytes: usize) -> Frame {
 }
 
 pub(super) fn publisher(broker: &dyn Broker, name: &str, depth: u32) -> Arc<dyn Publisher> {
-    let options = PublisherOptions {
-        depth,
-        ..PublisherOptions::default()
-    };
+    let options = PublisherOptions { depth, ..PublisherOptions::default() };
     broker.publisher(&channel(name), options).unwrap()
 }
 
 /// Publishes and insists that it is taken.
 pub(super) fn publish(publisher: &dyn Publisher, number: u8, sequence: u64) {
-    assert_eq!(
-        publisher.publish(&frame(number, sequence, 100), None),
-        PublishOutcome::Taken
-    );
+    assert_eq!(publisher.publish(&frame(number, sequence, 100), None), PublishOutcome::Taken);
 }
 
 /// Waits until the server has all that was taken.
@@ -155,10 +140,7 @@ pub(super) async fn settled(publisher: &dyn Publisher) {
 }
 
 pub(super) async fn subscribe(broker: &dyn Broker, name: &str) -> Subscription {
-    broker
-        .subscribe(&channel(name), SubscribeOptions::default())
-        .await
-        .unwrap()
+    broker.subscribe(&channel(name), SubscribeOptions::default()).await.unwrap()
 }
 
 pub(super) async fn subscribe_with_kept(broker: &dyn Broker, name: &str) -> Subscription {

@@ -1,12 +1,14 @@
-//! Main service, broker and database are killed while many write. Soon after the last one is back, every worker has exactly
-//! what the main service has, and services are told exactly that.
+//! Main service, broker and database are killed while many write. Soon after the last one is back,
+//! every worker has exactly what the main service has, and services are told exactly that.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::redis::RedisKeys;
 use blaze_domain::node_file::{NodeBroker, NodeFile};
-use blaze_tests::fleet::{Api, MainService, MainStore, Worker, WorkerProcess, WorkerSpec, wait_equal};
+use blaze_tests::fleet::{
+    Api, MainService, MainStore, Worker, WorkerProcess, WorkerSpec, wait_equal,
+};
 use blaze_tests::process::usage;
 use blaze_tests::servers::{MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer};
 use blaze_tests::{wait, within};
@@ -58,10 +60,7 @@ async fn after_kills_in_the_middle_of_writes_all_workers_have_what_the_main_serv
     let folder = tempfile::tempdir().unwrap();
     let mongo = MongoServer::start(MongoOptions::default()).unwrap();
     let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
-    let store = MainStore::Mongo {
-        uri: mongo.uri(),
-        database: "main".to_owned(),
-    };
+    let store = MainStore::Mongo { uri: mongo.uri(), database: "main".to_owned() };
     let main = MainService::start(folder.path(), &store).unwrap();
     let api = main.api().unwrap();
     let names: Vec<String> = (0..inside).map(node).chain((0..outside).map(process_node)).collect();
@@ -75,10 +74,7 @@ async fn after_kills_in_the_middle_of_writes_all_workers_have_what_the_main_serv
         })
         .collect();
     wait_equal(&api, &workers, PATIENCE).await.unwrap();
-    println!(
-        "{inside} workers in this process: {}",
-        usage(std::process::id()).unwrap()
-    );
+    println!("{inside} workers in this process: {}", usage(std::process::id()).unwrap());
 
     let begun = Instant::now();
     let progress = Arc::new(Progress::new(goal));
@@ -97,7 +93,8 @@ async fn after_kills_in_the_middle_of_writes_all_workers_have_what_the_main_serv
     all_equal(&api, &workers, &processes).await;
     let (unknown, refused) = progress.others();
     println!(
-        "{} writes ({unknown} unknown, {refused} of what was gone) and {kills} kills in {:?}; all equal after {:?}; {}",
+        "{} writes ({unknown} unknown, {refused} of what was gone) and {kills} kills in {:?}; all \
+         equal after {:?}; {}",
         progress.done(),
         ended - begun,
         ended.elapsed(),
@@ -141,13 +138,18 @@ async fn all_equal(api: &Api, workers: &[Worker], processes: &[(String, WorkerPr
         }
         tokio::time::sleep(Duration::from_millis(20)).await;
     };
-    if let Err(error) = wait_equal(api, workers, within(EQUAL).saturating_sub(begun.elapsed())).await {
+    if let Err(error) =
+        wait_equal(api, workers, within(EQUAL).saturating_sub(begun.elapsed())).await
+    {
         panic!("{error:#}");
     }
     for (name, process) in processes {
         loop {
             let status = block_in_place(|| process.status()).unwrap();
-            if status["digest"] == digest.as_str() && status["connected"] == true && status["source"] == "main" {
+            if status["digest"] == digest.as_str()
+                && status["connected"] == true
+                && status["source"] == "main"
+            {
                 break;
             }
             assert!(begun.elapsed() < within(EQUAL), "{name} has not {digest}: {status}");
@@ -156,7 +158,8 @@ async fn all_equal(api: &Api, workers: &[Worker], processes: &[(String, WorkerPr
     }
 }
 
-/// What services on a node have by the main service, against what they are told: by the worker, and by the keys in Redis.
+/// What services on a node have by the main service, against what they are told: by the worker, and
+/// by the keys in Redis.
 async fn services_are_told_that(
     api: &Api,
     workers: &[Worker],
@@ -186,8 +189,9 @@ async fn services_are_told_that(
             // A notice waits until the broker takes it.
             loop {
                 let found = keys.get(&format!("blaze:config:{name}")).await;
-                let found =
-                    found.map(|key| key.map_or(Value::Null, |key| serde_json::from_slice::<Value>(&key).unwrap()));
+                let found = found.map(|key| {
+                    key.map_or(Value::Null, |key| serde_json::from_slice::<Value>(&key).unwrap())
+                });
                 if found.as_ref().is_ok_and(|key| key["hash"] == expected) {
                     break;
                 }
@@ -205,9 +209,7 @@ async fn services_are_told_that(
 async fn told(worker: &Worker, service: &str) -> Value {
     let status = worker.running().status().await.unwrap();
     let rows = status.json["services"].as_array().unwrap();
-    let row = rows
-        .iter()
-        .find(|row| row["service"] == service && row["instance"].is_null());
+    let row = rows.iter().find(|row| row["service"] == service && row["instance"].is_null());
     row.map(|row| row["hash"].clone()).unwrap_or_default()
 }
 
@@ -226,7 +228,8 @@ async fn hash(api: &Api, service: &str, node: &str) -> Value {
 }
 
 fn keys(url: &str, node: &str) -> RedisKeys {
-    let file = serde_json::json!({ "brokers": { "node": { "redis": { "url": url, "prefix": format!("{node}:") } } } });
+    let file = serde_json::json!({ "brokers": { "node": { "redis": { "url": url,
+        "prefix": format!("{node}:") } } } });
     match NodeFile::read(&file).unwrap().0.brokers.node {
         Some(NodeBroker::Redis(section)) => RedisKeys::open(&section).unwrap(),
         other => panic!("{other:?}"),

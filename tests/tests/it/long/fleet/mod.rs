@@ -1,4 +1,5 @@
-//! Many workers at once: what becomes of all of them while parts are killed, and how they come back.
+//! Many workers at once: what becomes of all of them while parts are killed, and how they come
+//! back.
 //!
 //! Needs `cargo build --workspace` and `scripts/services install`.
 

@@ -1,4 +1,5 @@
-//! The main service goes and comes under many workers: they come back one after the other, and users do not wait for them.
+//! The main service goes and comes under many workers: they come back one after the other, and
+//! users do not wait for them.
 
 use std::time::Duration;
 
@@ -14,7 +15,8 @@ const AWAY: Duration = Duration::from_secs(4);
 const BACK: Duration = Duration::from_secs(5);
 /// A user's GET at the 99th percentile.
 const GET: Duration = Duration::from_secs(1);
-/// In any such time at most half of the workers come back; of two seconds, an eighth does on average.
+/// In any such time at most half of the workers come back; of two seconds, an eighth does on
+/// average.
 const QUARTER: Duration = Duration::from_millis(250);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -36,7 +38,8 @@ async fn workers_come_back_one_after_the_other_and_users_do_not_wait_for_them() 
     let p99 = restarted.gets[restarted.gets.len() * 99 / 100];
     let (first, last) = (restarted.back[0], restarted.back[restarted.back.len() - 1]);
     println!(
-        "{} workers back between {first:?} and {last:?}; {} GETs, p99 {p99:?}, {} not answered; away for {:?}",
+        "{} workers back between {first:?} and {last:?}; {} GETs, p99 {p99:?}, {} not answered; \
+         away for {:?}",
         workers.len(),
         restarted.gets.len(),
         restarted.refused,
@@ -44,21 +47,16 @@ async fn workers_come_back_one_after_the_other_and_users_do_not_wait_for_them() 
     );
     assert!(p99 <= within(GET), "a user's GET took {p99:?}");
     // Who is not answered hears so at once, and nobody is refused once the main service is back.
-    assert!(
-        restarted.slowest_refusal <= within(GET),
-        "{:?}",
-        restarted.slowest_refusal
-    );
+    assert!(restarted.slowest_refusal <= within(GET), "{:?}", restarted.slowest_refusal);
     assert_eq!(restarted.refused_since, 0);
     assert!(last <= within(BACK), "the last worker came back after {last:?}");
     let most = restarted.back.iter().enumerate().map(|(number, begin)| {
-        let close = restarted.back[number..]
-            .iter()
-            .take_while(|time| **time < *begin + QUARTER);
+        let close = restarted.back[number..].iter().take_while(|time| **time < *begin + QUARTER);
         close.count()
     });
     let most = most.max().unwrap();
-    // Those that come back before anybody saw the main service again count as one moment, longer where others run beside.
+    // Those that come back before anybody saw the main service again count as one moment, longer
+    // where others run beside.
     let share = if blaze_tests::long() { 0.5 } else { 0.75 };
     assert!(
         most as f64 <= share * workers.len() as f64,

@@ -1,4 +1,5 @@
-//! Somebody who changes documents of every kind: creates, updates, deletes, and makes anew under the same name at once.
+//! Somebody who changes documents of every kind: creates, updates, deletes, and makes anew under
+//! the same name at once.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -53,14 +54,12 @@ impl Progress {
 
     /// Writes of which nobody knows, and those that made no sense any more after one of them.
     pub(super) fn others(&self) -> (usize, usize) {
-        (
-            self.unknown.load(Ordering::Acquire),
-            self.refused.load(Ordering::Acquire),
-        )
+        (self.unknown.load(Ordering::Acquire), self.refused.load(Ordering::Acquire))
     }
 }
 
-/// A writer. Nobody else changes its services and nodes; overrides of nodes with workers are shared out.
+/// A writer. Nobody else changes its services and nodes; overrides of nodes with workers are shared
+/// out.
 pub(super) struct Writer {
     api: Api,
     number: usize,
@@ -72,7 +71,12 @@ pub(super) struct Writer {
 }
 
 impl Writer {
-    pub(super) fn new(api: Api, number: usize, nodes: Vec<String>, progress: Arc<Progress>) -> Self {
+    pub(super) fn new(
+        api: Api,
+        number: usize,
+        nodes: Vec<String>,
+        progress: Arc<Progress>,
+    ) -> Self {
         Self {
             api,
             number,
@@ -99,26 +103,27 @@ impl Writer {
             0..35 => self.apply(&[service(&name, &json!({ "count": count }))]).await,
             35..55 => {
                 let spec = json!({ "node": node, "config": { "of_instance": count } });
-                let instance = json!({ "kind": "Instance", "service": name, "name": "0", "spec": spec });
+                let instance =
+                    json!({ "kind": "Instance", "service": name, "name": "0", "spec": spec });
                 // The service may be away.
                 self.apply(&[service(&name, &json!({ "with": count })), instance]).await;
             }
             55..70 => {
                 let spec = json!({ "layer": LAYER, "overrides": { name: { "of_node": count } } });
-                self.apply(&[json!({ "kind": "Node", "name": node, "spec": spec })])
-                    .await;
+                self.apply(&[json!({ "kind": "Node", "name": node, "spec": spec })]).await;
             }
             70..78 => {
-                let spec = json!({ "kind": "edge", "config": { "of_layer": format!("{}-{count}", self.number) } });
-                self.apply(&[json!({ "kind": "Layer", "name": LAYER, "spec": spec })])
-                    .await;
+                let spec = json!({
+                    "kind": "edge",
+                    "config": { "of_layer": format!("{}-{count}", self.number) },
+                });
+                self.apply(&[json!({ "kind": "Layer", "name": LAYER, "spec": spec })]).await;
             }
             78..84 => {
                 let name = format!("spare-{}-{}", self.number, self.random.random_range(0..NODES));
                 if self.random.random_bool(0.5) {
                     let spec = json!({ "layer": LAYER, "config": { "spare": count } });
-                    self.apply(&[json!({ "kind": "Node", "name": name, "spec": spec })])
-                        .await;
+                    self.apply(&[json!({ "kind": "Node", "name": name, "spec": spec })]).await;
                 } else {
                     self.delete(&format!("/nodes/{name}")).await;
                 }
@@ -161,9 +166,7 @@ impl Writer {
                 }
                 Told::NotNow(_) => tokio::time::sleep(PAUSE).await,
                 refused @ Told::Refused { .. } => {
-                    self.progress
-                        .fault
-                        .get_or_init(|| format!("{method} {path}: {refused:?}"));
+                    self.progress.fault.get_or_init(|| format!("{method} {path}: {refused:?}"));
                     return;
                 }
             }

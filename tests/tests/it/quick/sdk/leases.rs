@@ -1,4 +1,5 @@
-//! Leases against a flow that answers as the contract says, on a clock that stands still until all wait.
+//! Leases against a flow that answers as the contract says, on a clock that stands still until all
+//! wait.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,7 +9,8 @@ use blaze_brokers::{Broker as _, Content, PublisherOptions, SubscribeOptions, Su
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Durability, Reliability, Scope};
 use blaze_sdk::{
-    Advertise, FlowError, FlowEventKind, LeaseState, OriginFilter, Request, ServiceManager, ServiceOptions,
+    Advertise, FlowError, FlowEventKind, LeaseState, OriginFilter, Request, ServiceManager,
+    ServiceOptions,
 };
 use bytes::Bytes;
 use serde_json::{Value, json};
@@ -25,15 +27,9 @@ struct FakeFlow {
 impl FakeFlow {
     async fn start(hub: &MemoryHub) -> Self {
         let broker = hub.broker();
-        let control = broker
-            .subscribe(&ChannelName::control(), SubscribeOptions::default())
-            .await
-            .unwrap();
-        Self {
-            broker,
-            control,
-            waiting: Vec::new(),
-        }
+        let control =
+            broker.subscribe(&ChannelName::control(), SubscribeOptions::default()).await.unwrap();
+        Self { broker, control, waiting: Vec::new() }
     }
 
     /// The next control message and when it came.
@@ -41,9 +37,7 @@ impl FakeFlow {
         while self.waiting.is_empty() {
             let mut batch = Vec::new();
             let wait = self.control.receive(&mut batch, 1);
-            tokio::time::timeout(Duration::from_secs(60), wait)
-                .await
-                .expect("a control message");
+            tokio::time::timeout(Duration::from_secs(60), wait).await.expect("a control message");
             let Content::Bare { payload, .. } = &batch[0].content else {
                 panic!("control messages are JSON: {batch:?}");
             };
@@ -67,14 +61,19 @@ impl FakeFlow {
     }
 
     fn agree(&self, to: &Value) {
-        let answer = json!({"id": to["id"], "ok": true, "flow": "edge/robot-1", "lease_s": TTL.as_secs()});
+        let answer =
+            json!({"id": to["id"], "ok": true, "flow": "edge/robot-1", "lease_s": TTL.as_secs()});
         self.say(to["reply_to"].as_str().unwrap(), &answer);
     }
 
     fn started(&self) {
         self.say(
             "blaze/flow/events",
-            &json!({"event": "flow_started", "flow": "edge/robot-1", "time": "2026-01-01T00:00:00Z"}),
+            &json!({
+                "event": "flow_started",
+                "flow": "edge/robot-1",
+                "time": "2026-01-01T00:00:00Z",
+            }),
         );
     }
 }
@@ -91,9 +90,7 @@ async fn service(hub: &MemoryHub) -> ServiceManager {
             Scope::Node,
         )
     };
-    ServiceManager::start(options.on_node("robot-1".parse().unwrap()))
-        .await
-        .unwrap()
+    ServiceManager::start(options.on_node("robot-1".parse().unwrap())).await.unwrap()
 }
 
 fn imu() -> Advertise {
@@ -110,7 +107,11 @@ fn imu() -> Advertise {
 }
 
 /// Advertises, while the flow agrees.
-async fn advertised(service: &ServiceManager, flow: &mut FakeFlow, advertise: Advertise) -> blaze_sdk::Lease {
+async fn advertised(
+    service: &ServiceManager,
+    flow: &mut FakeFlow,
+    advertise: Advertise,
+) -> blaze_sdk::Lease {
     let (lease, ()) = tokio::join!(service.flow().advertise(advertise), async {
         let (_, sent) = flow.next().await;
         flow.agree(&sent);
@@ -168,10 +169,7 @@ async fn a_request_names_the_origin_that_it_wants() {
     let service = service(&hub).await;
     let request = Request {
         max_rate_hz: Some(10.0),
-        from: OriginFilter {
-            layer: Some("cloud".parse().unwrap()),
-            ..OriginFilter::default()
-        },
+        from: OriginFilter { layer: Some("cloud".parse().unwrap()), ..OriginFilter::default() },
         ..Request::new("cmd".parse().unwrap())
     };
     let (lease, sent) = tokio::join!(service.flow().request(request), async {
@@ -208,10 +206,7 @@ async fn a_started_flow_hears_of_all_leases_within_250_ms() {
     topics.sort();
     assert_eq!(topics, ["t/0", "t/1", "t/2", "t/3", "t/4"]);
     let event = events.next().await.unwrap();
-    assert_eq!(
-        (event.kind, event.flow.as_str()),
-        (FlowEventKind::FlowStarted, "edge/robot-1")
-    );
+    assert_eq!((event.kind, event.flow.as_str()), (FlowEventKind::FlowStarted, "edge/robot-1"));
     assert_eq!(event.time, "2026-01-01T00:00:00Z");
 }
 
@@ -307,23 +302,11 @@ async fn values_that_cannot_be_are_refused_without_a_message() {
     let hub = MemoryHub::new("t");
     let mut flow = FakeFlow::start(&hub).await;
     let service = service(&hub).await;
-    let advertise = Advertise {
-        rate_hz: Some(0.0),
-        ..imu()
-    };
+    let advertise = Advertise { rate_hz: Some(0.0), ..imu() };
     let refused = service.flow().advertise(advertise).await.unwrap_err();
-    assert!(
-        matches!(refused, FlowError::Invalid { field: "rate_hz", .. }),
-        "{refused}"
-    );
-    let request = Request {
-        depth: 0,
-        ..Request::new("a".parse().unwrap())
-    };
+    assert!(matches!(refused, FlowError::Invalid { field: "rate_hz", .. }), "{refused}");
+    let request = Request { depth: 0, ..Request::new("a".parse().unwrap()) };
     let refused = service.flow().request(request).await.unwrap_err();
-    assert!(
-        matches!(refused, FlowError::Invalid { field: "depth", .. }),
-        "{refused}"
-    );
+    assert!(matches!(refused, FlowError::Invalid { field: "depth", .. }), "{refused}");
     assert!(flow.next_within(TTL).await.is_none());
 }

@@ -12,7 +12,8 @@ use blaze_domain::{Origin, Scope, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
 use blaze_runtime::Supervisor;
 use blaze_sdk::{
-    Message, PublishOptions, PublishOutcome, SdkError, ServiceManager, ServiceOptions, SubscribeOptions, Subscription,
+    Message, PublishOptions, PublishOutcome, SdkError, ServiceManager, ServiceOptions,
+    SubscribeOptions, Subscription,
 };
 use bytes::Bytes;
 
@@ -108,13 +109,8 @@ impl Raw {
     }
 
     fn send(&self, writer: u8, sequence: u64, edit: impl FnOnce(&mut Header)) {
-        let mut header = Header::new(
-            &self.topic,
-            Origin::default(),
-            WriterId([writer; 16]),
-            sequence,
-            now_ns(),
-        );
+        let mut header =
+            Header::new(&self.topic, Origin::default(), WriterId([writer; 16]), sequence, now_ns());
         edit(&mut header);
         let frame = Frame::new(&header, Bytes::from(sequence.to_string())).unwrap();
         assert_eq!(self.to.publish(&frame, None), PublishOutcome::Taken);
@@ -122,13 +118,8 @@ impl Raw {
 }
 
 fn now_ns() -> u64 {
-    u64::try_from(
-        SystemTime::now()
-            .duration_since(SystemTime::UNIX_EPOCH)
-            .unwrap()
-            .as_nanos(),
-    )
-    .unwrap()
+    u64::try_from(SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap().as_nanos())
+        .unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -144,10 +135,7 @@ async fn a_message_tells_who_published_it_when_and_what_it_is() {
     };
     let publisher = sender.broker().publisher(&topic("imu/data"), &options).unwrap();
     let measured = SystemTime::now() - Duration::from_secs(3);
-    assert_eq!(
-        publisher.publish_at(Bytes::from_static(b"{}"), measured),
-        PublishOutcome::Taken
-    );
+    assert_eq!(publisher.publish_at(Bytes::from_static(b"{}"), measured), PublishOutcome::Taken);
     let message = heard.recv_timeout(DEADLINE).unwrap();
     let origin = message.origin();
     assert_eq!(
@@ -162,10 +150,7 @@ async fn a_message_tells_who_published_it_when_and_what_it_is() {
     assert_eq!(&message.payload()[..], b"{}");
     assert_eq!(message.publish_time(), Some(measured));
     let age = message.age();
-    assert!(
-        age >= Duration::from_secs(3) && age < Duration::from_secs(23),
-        "{age:?}"
-    );
+    assert!(age >= Duration::from_secs(3) && age < Duration::from_secs(23), "{age:?}");
     let other = sender.broker().publisher(&topic("imu/data"), &options).unwrap();
     assert_ne!(other.writer(), publisher.writer());
 }
@@ -179,10 +164,7 @@ async fn messages_of_each_writer_come_one_at_a_time_and_in_order() {
     let seen: Arc<Mutex<Seen>> = Arc::default();
     let wrong = Arc::new(AtomicUsize::new(0));
     let (noted, errors) = (Arc::clone(&seen), Arc::clone(&wrong));
-    let options = SubscribeOptions {
-        max_messages: 10_000,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { max_messages: 10_000, ..SubscribeOptions::default() };
     let subscription = service
         .broker()
         .subscribe(&topic("t"), options, move |message| {
@@ -201,22 +183,15 @@ async fn messages_of_each_writer_come_one_at_a_time_and_in_order() {
         .await
         .unwrap();
     let publishers: Vec<_> = (0..3)
-        .map(|_| {
-            service
-                .broker()
-                .publisher(&topic("t"), &PublishOptions::default())
-                .unwrap()
-        })
+        .map(|_| service.broker().publisher(&topic("t"), &PublishOptions::default()).unwrap())
         .collect();
     for _ in 0..MESSAGES {
         for publisher in &publishers {
             publisher.publish(Bytes::from_static(b"x"));
         }
     }
-    eventually("all messages are delivered", || {
-        subscription.stats().delivered == 3 * MESSAGES
-    })
-    .await;
+    eventually("all messages are delivered", || subscription.stats().delivered == 3 * MESSAGES)
+        .await;
     subscription.close().await;
     assert_eq!(wrong.load(Ordering::Relaxed), 0);
     assert!(seen.lock().unwrap().values().all(|(_, last)| *last == MESSAGES));
@@ -226,10 +201,7 @@ async fn messages_of_each_writer_come_one_at_a_time_and_in_order() {
 async fn concurrency_runs_callbacks_of_one_writer_at_the_same_time() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 4).await;
-    let options = SubscribeOptions {
-        concurrency: 3,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { concurrency: 3, ..SubscribeOptions::default() };
     // Each callback waits for the two others: with fewer at once, none would ever end.
     let together = Arc::new(std::sync::Barrier::new(3));
     let meet = Arc::clone(&together);
@@ -242,10 +214,7 @@ async fn concurrency_runs_callbacks_of_one_writer_at_the_same_time() {
         })
         .await
         .unwrap();
-    let publisher = service
-        .broker()
-        .publisher(&topic("t"), &PublishOptions::default())
-        .unwrap();
+    let publisher = service.broker().publisher(&topic("t"), &PublishOptions::default()).unwrap();
     for _ in 0..3 {
         publisher.publish(Bytes::new());
     }
@@ -280,10 +249,8 @@ async fn slow_callbacks_do_not_hold_up_others_even_if_there_are_more_than_thread
     }
     eventually("all five slow callbacks run", || entered.load(Ordering::SeqCst) == 5).await;
     let (_quick, heard) = listen(&service, "quick", SubscribeOptions::default()).await;
-    let publisher = service
-        .broker()
-        .publisher(&topic("quick"), &PublishOptions::default())
-        .unwrap();
+    let publisher =
+        service.broker().publisher(&topic("quick"), &PublishOptions::default()).unwrap();
     for sequence in 1..=100 {
         publisher.publish(Bytes::new());
         assert_eq!(heard.recv_timeout(DEADLINE).unwrap().sequence(), Some(sequence));
@@ -329,10 +296,7 @@ async fn a_full_queue_drops_the_oldest_and_counts_them() {
     let gate = Gate::closed();
     let (sender, heard) = mpsc::sync_channel(1_000);
     let wait = gate.waiter();
-    let options = SubscribeOptions {
-        max_messages: 10,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { max_messages: 10, ..SubscribeOptions::default() };
     let subscription = service
         .broker()
         .subscribe(&topic("t"), options, move |message| {
@@ -424,23 +388,15 @@ async fn bare_messages_come_and_malformed_ones_are_counted() {
 async fn late_joiners_get_what_is_kept_and_repeats_once() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
-    let options = PublishOptions {
-        depth: 2,
-        ..PublishOptions::default()
-    };
+    let options = PublishOptions { depth: 2, ..PublishOptions::default() };
     let publisher = service.broker().publisher(&topic("map"), &options).unwrap();
     for _ in 0..5 {
         publisher.publish(Bytes::new());
     }
-    let options = SubscribeOptions {
-        with_kept: true,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { with_kept: true, ..SubscribeOptions::default() };
     let (_subscription, heard) = listen(&service, "map", options).await;
     publisher.publish(Bytes::new());
-    let found: Vec<_> = (0..3)
-        .map(|_| heard.recv_timeout(DEADLINE).unwrap().sequence())
-        .collect();
+    let found: Vec<_> = (0..3).map(|_| heard.recv_timeout(DEADLINE).unwrap().sequence()).collect();
     assert_eq!(found, [Some(4), Some(5), Some(6)]);
 }
 
@@ -458,26 +414,14 @@ async fn bad_options_are_refused_with_their_name() {
         }
     };
     for rate in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-        let options = SubscribeOptions {
-            max_rate_hz: Some(rate),
-            ..SubscribeOptions::default()
-        };
+        let options = SubscribeOptions { max_rate_hz: Some(rate), ..SubscribeOptions::default() };
         assert_eq!(refused(options).await, "max_rate_hz");
     }
-    let options = SubscribeOptions {
-        concurrency: 0,
-        ..SubscribeOptions::default()
-    };
+    let options = SubscribeOptions { concurrency: 0, ..SubscribeOptions::default() };
     assert_eq!(refused(options).await, "concurrency");
-    let options = PublishOptions {
-        encoding: "x".repeat(201),
-        ..PublishOptions::default()
-    };
+    let options = PublishOptions { encoding: "x".repeat(201), ..PublishOptions::default() };
     assert!(service.broker().publisher(&topic("t"), &options).is_err());
-    let publisher = service
-        .broker()
-        .publisher(&topic("t"), &PublishOptions::default())
-        .unwrap();
+    let publisher = service.broker().publisher(&topic("t"), &PublishOptions::default()).unwrap();
     let large = Bytes::from(vec![0; blaze_domain::MAX_PAYLOAD_BYTES + 1]);
     assert_eq!(publisher.publish(large), PublishOutcome::TooLarge);
     assert_eq!(publisher.sequence(), 0);
@@ -496,11 +440,7 @@ async fn dropping_a_subscription_ends_it_at_the_broker() {
     eventually("the broker has no reader", || hub.subscriptions_of(&channel) == 0).await;
     raw.send(1, 2, |_| {});
     let end = heard.recv_timeout(DEADLINE);
-    assert_eq!(
-        end.unwrap_err(),
-        mpsc::RecvTimeoutError::Disconnected,
-        "the callback is gone"
-    );
+    assert_eq!(end.unwrap_err(), mpsc::RecvTimeoutError::Disconnected, "the callback is gone");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -540,11 +480,7 @@ async fn a_service_runs_under_the_supervisor_that_it_is_given_and_ends_with_it()
         Arc::new(hub.broker()),
         Scope::Node,
     );
-    let options = ServiceOptions {
-        supervisor: Some(process.clone()),
-        pool_threads: 2,
-        ..options
-    };
+    let options = ServiceOptions { supervisor: Some(process.clone()), pool_threads: 2, ..options };
     let service = ServiceManager::start(options).await.unwrap();
     let (_subscription, heard) = listen(&service, "t", SubscribeOptions::default()).await;
     Raw::new(&hub, "t").send(1, 1, |_| {});
@@ -564,9 +500,7 @@ async fn a_service_runs_under_the_supervisor_that_it_is_given_and_ends_with_it()
     let report = process.shutdown(DEADLINE).await;
     assert!(report.is_clean(), "{report:?}");
     assert_eq!((hub.stats().subscriptions, process.running()), (0, Vec::new()));
-    let refused = service
-        .broker()
-        .subscribe(&topic("t"), SubscribeOptions::default(), |_| {})
-        .await;
+    let refused =
+        service.broker().subscribe(&topic("t"), SubscribeOptions::default(), |_| {}).await;
     assert!(matches!(refused, Err(SdkError::ShutDown)), "{refused:?}");
 }

@@ -56,13 +56,7 @@ fn what_is_decompressed_comes_in_the_order_of_its_writer() {
     hands.end(1);
     assert_eq!(hands.written(), []);
     hands.end(0);
-    let aged = hands
-        .bench
-        .out
-        .frames
-        .lock()
-        .iter()
-        .all(|frame| frame.age_us() == 3_000);
+    let aged = hands.bench.out.frames.lock().iter().all(|frame| frame.age_us() == 3_000);
     assert!(aged, "older by what the codec took");
     assert_eq!(hands.written(), [(1, 1, LARGE), (1, 2, 10), (1, 3, SMALL)]);
     assert!(!hands.bench.core.has_unwritten());
@@ -75,10 +69,7 @@ fn what_lies_about_its_size_or_is_damaged_holds_nobody_up() {
     let block = lz4::compress(&[0; SMALL], 1).unwrap();
     // More than so few bytes can hold: refused at once, and no room is taken for it.
     hands.deliver(lying(1, block.clone(), 16 << 20));
-    assert_eq!(
-        (hands.quick, hands.bench.drops()),
-        (0, vec![(DropReason::DecompressError, 1)])
-    );
+    assert_eq!((hands.quick, hands.bench.drops()), (0, vec![(DropReason::DecompressError, 1)]));
     hands.deliver(lying(2, block.clone(), SMALL as u64 + 1));
     hands.deliver(lying(3, block.clone(), SMALL as u64 - 1));
     hands.deliver(lying(4, Bytes::from(vec![0xff; 100]), 5_000));
@@ -163,10 +154,7 @@ fn quick_turns_are_for_both_directions() {
     for _ in 0..6 {
         hands.begin(Urgency::Quick);
     }
-    let inward: Vec<bool> = hands
-        .jobs
-        .iter()
-        .map(|job| matches!(job.work, Work::Decompress(_)))
-        .collect();
+    let inward: Vec<bool> =
+        hands.jobs.iter().map(|job| matches!(job.work, Work::Decompress(_))).collect();
     assert_eq!(inward, [true, false, true, false, true, false]);
 }

@@ -101,7 +101,8 @@ fn stream(hands: &mut Hands, next: &mut u64, hz: u32, seconds: u32) {
     }
 }
 
-/// Of two threads one is kept for what is done in a moment, so 10 Hz · 200 ms are too much for level 3.
+/// Of two threads one is kept for what is done in a moment, so 10 Hz · 200 ms are too much for
+/// level 3.
 #[test]
 fn the_size_falls_when_the_level_rises_again() {
     let mut hands = Hands::new(vec![lane("cloud/c", false)]);
@@ -139,11 +140,9 @@ fn only_messages_that_are_worth_it_and_pass_some_lane_are_work_for_the_pool() {
     };
     run(&mut hands);
     let found = rate(&mut hands);
-    assert!(
-        (found - 5.0).abs() < 1.0,
-        "{found} of 20 Hz, and as many small messages"
-    );
-    // Two lanes with buckets of their own admit different frames, and each of these is to be compressed.
+    assert!((found - 5.0).abs() < 1.0, "{found} of 20 Hz, and as many small messages");
+    // Two lanes with buckets of their own admit different frames, and each of these is to be
+    // compressed.
     let mut faster = lane("fog/f", true);
     faster.lane.max_rate_hz = Some(7.0);
     hands.plan(vec![thinned, faster]);

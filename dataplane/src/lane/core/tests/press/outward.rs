@@ -78,10 +78,7 @@ fn a_frame_that_replaces_a_waiting_one_has_its_turn() {
 
 impl Hands {
     fn publish_on(&mut self, topic: TopicId, bytes: usize) {
-        let content = Content::Bare {
-            payload: Bytes::from(vec![0; bytes]),
-            identity: None,
-        };
+        let content = Content::Bare { payload: Bytes::from(vec![0; bytes]), identity: None };
         self.bench.take_on(topic, Scope::Node, vec![content]);
         self.look();
     }
@@ -109,10 +106,7 @@ fn one_topic_neither_fills_the_stage_nor_keeps_the_others_waiting() {
     let begun: Vec<usize> = hands.jobs.iter().map(|job| job.payload.len()).collect();
     assert_eq!(begun, [MIB, LARGE, MIB, LARGE]);
     let counters = hands.bench.core.press_counters();
-    assert_eq!(
-        (counters.waiting, counters.waiting_bytes, counters.refused),
-        (6, 6 * MIB, 12)
-    );
+    assert_eq!((counters.waiting, counters.waiting_bytes, counters.refused), (6, 6 * MIB, 12));
     hands.run();
     assert_eq!(hands.bench.core.press_counters().waiting, 0);
     hands.check();
@@ -155,11 +149,7 @@ fn a_receiver_that_does_not_decompress_gets_what_was_published() {
     hands.run();
     assert_eq!(hands.bench.link.submitted[1].2.payload().len(), LARGE);
     assert_eq!(hands.sent_compressed(), [true, false]);
-    assert_eq!(
-        hands.path().sent_size.largest(),
-        LARGE as u64,
-        "the largest that is sent"
-    );
+    assert_eq!(hands.path().sent_size.largest(), LARGE as u64, "the largest that is sent");
     // Where nobody does nothing is compressed.
     hands.bench.link.old = vec![old("fog/f"), old("cloud/c")];
     hands.publish(1, 2, LARGE);

@@ -1,4 +1,5 @@
-//! Whatever comes of it and when: each message is sent, dropped for a reason or waiting, and those of a writer in their order.
+//! Whatever comes of it and when: each message is sent, dropped for a reason or waiting, and those
+//! of a writer in their order.
 
 use std::collections::HashMap;
 
@@ -98,12 +99,8 @@ impl Hands {
             }
         }
         self.check();
-        let taken: Vec<u64> = self
-            .path()
-            .bridges
-            .iter()
-            .map(|bridge| bridge.stats.taken.messages)
-            .collect();
+        let taken: Vec<u64> =
+            self.path().bridges.iter().map(|bridge| bridge.stats.taken.messages).collect();
         assert!(
             seen.taken.iter().zip(&taken).all(|(before, now)| before <= now),
             "a counter goes back"
@@ -155,7 +152,8 @@ impl Hands {
 
 proptest! {
     #[test]
-    fn lanes_that_stay_get_everything_in_order_or_it_is_counted(steps in vec(work(), 1..120), reliable: bool) {
+    fn lanes_that_stay_get_everything_in_order_or_it_is_counted(steps in vec(work(), 1..120),
+        reliable: bool) {
         let mut thinned = lane("fog/f", false);
         thinned.lane.max_rate_hz = Some(100.0);
         thinned.lane.lifespan_ms = 50;
@@ -168,7 +166,8 @@ proptest! {
         hands.run();
         hands.come_to_rest();
         let published: u64 = seen.published.values().sum();
-        let taken: Vec<u64> = hands.path().bridges.iter().map(|bridge| bridge.stats.taken.messages).collect();
+        let taken: Vec<u64> =
+            hands.path().bridges.iter().map(|bridge| bridge.stats.taken.messages).collect();
         prop_assert_eq!(taken, [published; 3]);
         let sent = hands.by_lane();
         if reliable {
@@ -184,7 +183,8 @@ proptest! {
     }
 
     #[test]
-    fn plans_peers_and_the_pool_may_come_and_go(steps in vec(life(), 1..120), stops in 0usize..200) {
+    fn plans_peers_and_the_pool_may_come_and_go(steps in vec(life(), 1..120),
+        stops in 0usize..200) {
         let mut hands = Hands::new(plan(2));
         let mut seen = Seen::default();
         for (at, step) in steps.iter().enumerate() {

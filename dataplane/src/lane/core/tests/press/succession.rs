@@ -49,7 +49,8 @@ fn the_next_receiver_waits_for_what_is_with_the_codec() {
     assert_eq!(hands.sent(), [(1, 2, 1)]);
 }
 
-/// Message 1 went to `a`, which has not said that it has written it; 2 is held for `b`, and 3 is with the codec.
+/// Message 1 went to `a`, which has not said that it has written it; 2 is held for `b`, and 3 is
+/// with the codec.
 fn of_b() -> Hands {
     let mut hands = Hands::new(to("a"));
     hands.publish(9, 1, 100);
@@ -73,10 +74,7 @@ fn what_comes_from_the_codec_goes_where_that_before_it_went() {
     assert_eq!(hands.sent(), [(2, 1, 2), (2, 1, 3), (2, 1, 4)]);
     assert_eq!(hands.taken(), [1, 0, 3], "counted where they went, and nowhere else");
     hands.link_is_empty();
-    assert!(
-        !hands.bench.core.is_draining() && hands.bench.link.told.is_empty(),
-        "nobody asks `b`"
-    );
+    assert!(!hands.bench.core.is_draining() && hands.bench.link.told.is_empty(), "nobody asks `b`");
 }
 
 #[test]
@@ -170,9 +168,7 @@ fn of_what_is_kept_nothing_is_refused() {
     hands.link_is_empty();
     assert_eq!(hands.sent().len(), 12);
     hands.plan([durable("a"), durable("b")].concat());
-    let Bench {
-        core, link, now, topic, ..
-    } = &mut hands.bench;
+    let Bench { core, link, now, topic, .. } = &mut hands.bench;
     core.deliver_waiting(*now, *topic, link);
     hands.look();
     hands.run();
@@ -195,16 +191,10 @@ fn what_is_kept_goes_before_what_is_held() {
     hands.link_is_empty();
     hands.plan(durable("b"));
     hands.bench.take(Scope::Node, vec![kept(2, 100, 2)]);
-    let Bench {
-        core, link, now, topic, ..
-    } = &mut hands.bench;
+    let Bench { core, link, now, topic, .. } = &mut hands.bench;
     core.deliver_waiting(*now, *topic, link);
     hands.look();
-    assert_eq!(
-        (hands.quick, hands.long),
-        (0, 0),
-        "it would come back behind what is held"
-    );
+    assert_eq!((hands.quick, hands.long), (0, 0), "it would come back behind what is held");
     hands.answer("a");
     let sequences: Vec<u64> = hands.sent().iter().map(|(.., sequence)| *sequence).collect();
     assert_eq!(sequences, [1, 2, 2], "its receiver drops what it has");

@@ -1,26 +1,32 @@
-//! The bandwidth allocator against a second implementation that works with exact fractions, on generated sets of
-//! topics.
+//! The bandwidth allocator against a second implementation that works with exact fractions, on
+//! generated sets of topics.
 //!
-//! The sets are made to meet the corners: sizes at the threshold of large topics, equal demands, lanes with and without
-//! a limit, budgets from nothing to plenty and exactly at a limit, floors above the advertised rate, rates and sizes of
-//! 0. Each set is named by one number, its seed: `BLAZE_SEED=<seed>` runs that set alone. With `BLAZE_LONG` set there
+//! The sets are made to meet the corners: sizes at the threshold of large topics, equal demands,
+//! lanes with and without a limit, budgets from nothing to plenty and exactly at a limit, floors
+//! above the advertised rate, rates and sizes of
+//! 0. Each set is named by one number, its seed: `BLAZE_SEED=<seed>` runs that set alone. With
+//!    `BLAZE_LONG` set there
 //! are 1 000 000 sets instead of 20 000.
 //!
-//! Rates and bytes agree within 1e-9 of their value. To that comes what an `f64` cannot know: differences of amounts of
-//! the size of the budget are uncertain by some units in the last place of the budget.
+//! Rates and bytes agree within 1e-9 of their value. To that comes what an `f64` cannot know:
+//! differences of amounts of the size of the budget are uncertain by some units in the last place
+//! of the budget.
 
 mod oracle;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use blaze_flow::limit::allocate::{Allocation, Class, Grant, Lane, Sharing, Terms, Topic, allocate};
+use blaze_flow::limit::allocate::{
+    Allocation, Class, Grant, Lane, Sharing, Terms, Topic, allocate,
+};
 use num_rational::BigRational;
 use num_traits::{Signed, Zero};
 use oracle::{Limit, Share, Shares, exact, near};
 
 const TOLERANCE: f64 = 1e-9;
 
-/// A small generator of random numbers (SplitMix64): the same seed gives the same numbers on every machine.
+/// A small generator of random numbers (SplitMix64): the same seed gives the same numbers on every
+/// machine.
 struct Random {
     state: u64,
 }
@@ -142,7 +148,8 @@ fn is_large(topic: &Topic<'_>, terms: &Terms) -> bool {
 }
 
 fn terms(random: &mut Random, short: bool) -> Terms {
-    let sixteenths = |random: &mut Random, low: u64, high: u64| (low + random.below(high - low)) as f64 / 16.0;
+    let sixteenths =
+        |random: &mut Random, low: u64, high: u64| (low + random.below(high - low)) as f64 / 16.0;
     let overhead = match (short, random.below(10)) {
         (true, 0..7) => sixteenths(random, 16, 33),
         (_, 0..7) => 1.02,
@@ -202,7 +209,12 @@ fn rate(random: &mut Random, short: bool) -> f64 {
     }
 }
 
-fn lanes(random: &mut Random, short: bool, advertised_hz: f64, min_rate_hz: f64) -> Vec<Option<f64>> {
+fn lanes(
+    random: &mut Random,
+    short: bool,
+    advertised_hz: f64,
+    min_rate_hz: f64,
+) -> Vec<Option<f64>> {
     let count = match random.below(20) {
         0 => 0,
         1..9 => 1,
@@ -226,7 +238,8 @@ fn names(random: &mut Random, count: u64) -> Vec<String> {
     let mut taken = BTreeSet::new();
     let mut names = Vec::new();
     while (names.len() as u64) < count {
-        let mut name = String::from(random.pick(&["/a", "/a", "/camera", "/camera/front", "/é", "a"]));
+        let mut name =
+            String::from(random.pick(&["/a", "/a", "/camera", "/camera/front", "/é", "a"]));
         for _ in 0..random.below(4) {
             name.push(random.pick(&['a', 'b', '/', '0', 'A', '~', 'é', '文']));
         }
@@ -237,8 +250,8 @@ fn names(random: &mut Random, count: u64) -> Vec<String> {
     names
 }
 
-/// Whether the order of two demands is the same in whichever order their factors are multiplied: they are apart, or
-/// their factors differ by powers of two only.
+/// Whether the order of two demands is the same in whichever order their factors are multiplied:
+/// they are apart, or their factors differ by powers of two only.
 fn ordered(a: &Source, b: &Source) -> bool {
     let digits = |value: f64| value.to_bits() & ((1 << 52) - 1);
     let demand = |source: &Source| source.advertised_hz * source.size_bytes as f64;
@@ -268,12 +281,7 @@ fn sources(random: &mut Random, short: bool, terms: &Terms) -> Vec<Source> {
             _ => (size(random, terms.large_bytes), rate(random, short)),
         };
         let lanes = lanes(random, short, advertised_hz, terms.min_rate_hz);
-        let mut source = Source {
-            name,
-            size_bytes,
-            advertised_hz,
-            lanes,
-        };
+        let mut source = Source { name, size_bytes, advertised_hz, lanes };
         while !short && !sources.iter().all(|other| ordered(other, &source)) {
             source.advertised_hz *= 1.0 + random.between(0.001, 0.1);
         }
@@ -306,7 +314,8 @@ fn budget(random: &mut Random, case: &Case) -> f64 {
         _ => all * random.between(0.1, 1.0),
     };
     // Sums of short numbers are short, but not their products with random ones.
-    if case.short && budget.fract() != 0.0 && ![all, standard, standard + floors].contains(&budget) {
+    if case.short && budget.fract() != 0.0 && ![all, standard, standard + floors].contains(&budget)
+    {
         budget.floor()
     } else {
         budget
@@ -337,12 +346,7 @@ fn generate(seed: u64) -> Case {
     let short = random.chance(30);
     let terms = terms(&mut random, short);
     let topics = sources(&mut random, short, &terms);
-    let mut case = Case {
-        short,
-        budget: 0.0,
-        terms,
-        topics,
-    };
+    let mut case = Case { short, budget: 0.0, terms, topics };
     case.budget = budget(&mut random, &case);
     if random.chance(2) {
         spoil(&mut random, &mut case);
@@ -372,13 +376,20 @@ fn noise(budget: f64) -> f64 {
 struct Odds {
     /// Bytes per second.
     noise: f64,
-    /// Whether the standard topics want just the budget, so that rounding decides which of them is first.
+    /// Whether the standard topics want just the budget, so that rounding decides which of them is
+    /// first.
     order_undecided: bool,
 }
 
-/// One topic against the exact values. Returns whether rounding alone decided that its lanes have all that they want,
-/// so that the rate of the topic itself may be another one than the exact one.
-fn compare_topic(topic: &Topic<'_>, grant: &Grant, share: &Share, terms: &Terms, odds: Odds) -> Result<bool, String> {
+/// One topic against the exact values. Returns whether rounding alone decided that its lanes have
+/// all that they want, so that the rate of the topic itself may be another one than the exact one.
+fn compare_topic(
+    topic: &Topic<'_>,
+    grant: &Grant,
+    share: &Share,
+    terms: &Terms,
+    odds: Odds,
+) -> Result<bool, String> {
     let name = topic.name;
     ensure((grant.class == Class::Large) == share.large, || {
         format!("{name}: the class is {:?}", grant.class)
@@ -389,9 +400,7 @@ fn compare_topic(topic: &Topic<'_>, grant: &Grant, share: &Share, terms: &Terms,
     let same = close(grant.rate_hz, rate, rate_noise);
     let jump = near(&share.spare).abs() <= odds.noise || (odds.order_undecided && !share.large);
     let open = share.open && rate <= grant.rate_hz && grant.rate_hz <= number(topic.advertised_hz);
-    ensure(same || jump || open, || {
-        format!("{name}: {} Hz, not {rate}", grant.rate_hz)
-    })?;
+    ensure(same || jump || open, || format!("{name}: {} Hz, not {rate}", grant.rate_hz))?;
     for (lane, wanted) in topic.lanes.iter().zip(&share.lanes) {
         let (got, wanted) = (grant.lane_hz(lane), near(wanted));
         ensure(close(got, wanted, rate_noise), || {
@@ -399,14 +408,17 @@ fn compare_topic(topic: &Topic<'_>, grant: &Grant, share: &Share, terms: &Terms,
         })?;
     }
     let (got, wanted) = (grant.bytes_per_s, near(&share.bytes));
-    ensure(close(got, wanted, odds.noise), || {
-        format!("{name}: {got} bytes/s, not {wanted}")
-    })?;
+    ensure(close(got, wanted, odds.noise), || format!("{name}: {got} bytes/s, not {wanted}"))?;
     Ok(!same && !open)
 }
 
 /// All topics against the exact values.
-fn compare(case: &Case, topics: &[Topic<'_>], got: &Allocation, wanted: &Shares) -> Result<Tally, String> {
+fn compare(
+    case: &Case,
+    topics: &[Topic<'_>],
+    got: &Allocation,
+    wanted: &Shares,
+) -> Result<Tally, String> {
     let (budget, terms) = (number(case.budget), ranged(&case.terms));
     let noise = noise(budget);
     let order_undecided = near(&wanted.standard_excess).abs() <= noise;
@@ -414,9 +426,7 @@ fn compare(case: &Case, topics: &[Topic<'_>], got: &Allocation, wanted: &Shares)
     let mut tally = Tally::new();
     let mut count = |what, more: bool| *tally.entry(what).or_default() += u64::from(more);
     count("sets", true);
-    ensure(got.grants.len() == topics.len(), || {
-        format!("{} grants", got.grants.len())
-    })?;
+    ensure(got.grants.len() == topics.len(), || format!("{} grants", got.grants.len()))?;
     for ((topic, grant), share) in topics.iter().zip(&got.grants).zip(&wanted.shares) {
         let jump = compare_topic(topic, grant, share, &terms, odds)?;
         // Rounding alone decided whether the topic has its full demand.
@@ -434,7 +444,9 @@ fn compare(case: &Case, topics: &[Topic<'_>], got: &Allocation, wanted: &Shares)
         for (other_at, other) in topics.iter().enumerate().skip(at + 1) {
             let demand = |topic: &Topic<'_>| topic.size_bytes as f64 * topic.advertised_hz;
             let (share, other_share) = (&wanted.shares[at], &wanted.shares[other_at]);
-            let by_name = share.large && case.terms.sharing == Sharing::Paper && demand(topic) == demand(other);
+            let by_name = share.large
+                && case.terms.sharing == Sharing::Paper
+                && demand(topic) == demand(other);
             // The name decides which is first, and different limits hold.
             count("ties", by_name && share.limit != other_share.limit);
         }
@@ -444,22 +456,14 @@ fn compare(case: &Case, topics: &[Topic<'_>], got: &Allocation, wanted: &Shares)
     })?;
 
     // Whether a set is feasible is clear, or its numbers are short, or rounding decides.
-    let clear =
-        near(&wanted.excess).abs() > TOLERANCE * budget || wanted.excess.is_zero() && (case.short || budget.is_zero());
-    ensure(!clear || got.feasible == wanted.feasible, || {
-        format!("feasible is {}", got.feasible)
-    })?;
+    let clear = near(&wanted.excess).abs() > TOLERANCE * budget
+        || wanted.excess.is_zero() && (case.short || budget.is_zero());
+    ensure(!clear || got.feasible == wanted.feasible, || format!("feasible is {}", got.feasible))?;
     count("undecided", !clear);
-    count(
-        "exactly at limit",
-        wanted.excess.is_zero() && case.short && budget > 0.0,
-    );
+    count("exactly at limit", wanted.excess.is_zero() && case.short && budget > 0.0);
     count("fair", case.terms.sharing == Sharing::Fair);
     count("standard exceeds", wanted.standard_excess.is_positive());
-    count(
-        "floors exceed",
-        !wanted.feasible && !wanted.standard_excess.is_positive(),
-    );
+    count("floors exceed", !wanted.feasible && !wanted.standard_excess.is_positive());
     Ok(tally)
 }
 
@@ -487,10 +491,9 @@ fn properties(case: &Case, topics: &[Topic<'_>], got: &Allocation) -> Result<(),
     let fits = standard <= budget * (1.0 - TOLERANCE);
     for (topic, grant) in topics.iter().zip(&got.grants) {
         let name = topic.name;
-        let (advertised, least, all) = (number(topic.advertised_hz), floor(topic, &terms), full(topic, &terms));
-        let Grant {
-            rate_hz, bytes_per_s, ..
-        } = *grant;
+        let (advertised, least, all) =
+            (number(topic.advertised_hz), floor(topic, &terms), full(topic, &terms));
+        let Grant { rate_hz, bytes_per_s, .. } = *grant;
         ensure(rate_hz >= 0.0 && rate_hz <= advertised * (1.0 + TOLERANCE), || {
             format!("{name}: {rate_hz} Hz of {advertised}")
         })?;
@@ -503,10 +506,9 @@ fn properties(case: &Case, topics: &[Topic<'_>], got: &Allocation) -> Result<(),
         })?;
         if is_large(topic, &terms) {
             let least_hz = advertised.min(terms.min_rate_hz);
-            ensure(
-                bytes_per_s >= below(least) && rate_hz >= least_hz * (1.0 - TOLERANCE),
-                || format!("{name}: {rate_hz} Hz, below the floor of {least_hz}"),
-            )?;
+            ensure(bytes_per_s >= below(least) && rate_hz >= least_hz * (1.0 - TOLERANCE), || {
+                format!("{name}: {rate_hz} Hz, below the floor of {least_hz}")
+            })?;
             let more = bytes_per_s < below(all.min(cap));
             ensure(!more || sum >= below(budget), || {
                 format!("{name} could have more: {sum} bytes/s of {budget}")
@@ -527,15 +529,11 @@ fn properties(case: &Case, topics: &[Topic<'_>], got: &Allocation) -> Result<(),
     Ok(())
 }
 
-/// Max-min fairness: no large topic below its limit has less than another one that is above its own floor.
+/// Max-min fairness: no large topic below its limit has less than another one that is above its own
+/// floor.
 fn fair(topics: &[Topic<'_>], got: &Allocation, terms: &Terms, budget: f64) -> Result<(), String> {
     let slack = |value: f64| TOLERANCE * (1.0 + value) + noise(budget);
-    let large = || {
-        topics
-            .iter()
-            .zip(&got.grants)
-            .filter(|(topic, _)| is_large(topic, terms))
-    };
+    let large = || topics.iter().zip(&got.grants).filter(|(topic, _)| is_large(topic, terms));
     let least = large()
         .filter(|(topic, grant)| {
             let limit = full(topic, terms).min(terms.share * budget);
@@ -654,23 +652,30 @@ fn rates_are_those_of_exact_arithmetic() {
 }
 
 /// A topic of a worked example.
-fn topic<'a>(name: &'a str, size_bytes: u64, advertised_hz: f64, lanes: &[Option<f64>]) -> Topic<'a> {
+fn topic<'a>(
+    name: &'a str,
+    size_bytes: u64,
+    advertised_hz: f64,
+    lanes: &[Option<f64>],
+) -> Topic<'a> {
     let lanes = lanes.iter().map(|&max_rate_hz| Lane { max_rate_hz }).collect();
-    Topic {
-        name,
-        size_bytes,
-        advertised_hz,
-        class: None,
-        lanes,
-    }
+    Topic { name, size_bytes, advertised_hz, class: None, lanes }
 }
 
 /// What a topic of a worked example gets: `r_i`, the rate of each lane, bytes per second.
 type Worked<'a> = (f64, &'a [f64], f64);
 
-/// Both implementations give exactly the worked values, which are chosen so that an `f64` holds each step to them.
-fn assert_worked(budget: f64, terms: &Terms, topics: &[Topic<'_>], wanted: &[Worked<'_>], feasible: bool) {
-    let is = |exact: &BigRational, value: f64| BigRational::from_float(value).as_ref() == Some(exact);
+/// Both implementations give exactly the worked values, which are chosen so that an `f64` holds
+/// each step to them.
+fn assert_worked(
+    budget: f64,
+    terms: &Terms,
+    topics: &[Topic<'_>],
+    wanted: &[Worked<'_>],
+    feasible: bool,
+) {
+    let is =
+        |exact: &BigRational, value: f64| BigRational::from_float(value).as_ref() == Some(exact);
     let (oracle, got) = (exact(budget, terms, topics), allocate(budget, terms, topics));
     assert_eq!(
         (oracle.shares.len(), got.grants.len(), topics.len()),
@@ -692,22 +697,18 @@ fn assert_worked(budget: f64, terms: &Terms, topics: &[Topic<'_>], wanted: &[Wor
         assert_eq!(running, *lanes, "{name}");
     }
     assert!(is(&oracle.used, used), "{} bytes/s in all", oracle.used);
-    assert_eq!(
-        (got.used_bytes_per_s, oracle.feasible, got.feasible),
-        (used, feasible, feasible)
-    );
+    assert_eq!((got.used_bytes_per_s, oracle.feasible, got.feasible), (used, feasible, feasible));
 }
 
 #[test]
 fn a_worked_example_of_the_share_of_the_paper() {
-    // B = 96000, α = 1.5, β·B = 48000, r_min = 2, large above 1000 bytes.
-    // Standard: imu costs 150 a Hz, 40 Hz on one lane: 6000. odom costs 300 a Hz, 20 Hz on one lane and 10 Hz on the
-    // other: 9000. Both fit; 81000 remain.
-    // Large, by demand: front 3000 · 30 = 90000, rear 6000 · 8 = 48000, side 3000 · 1 = 3000. Floors: rear 6000 · 2 =
-    // 12000, side 3000 · min(2, 1) = 3000.
-    // front: 81000 - 12000 - 3000 = 66000 is above β·B, so 48000. Up to 4 Hz both lanes cost 24000, and the other 24000
-    // are 8 Hz more on the lane without a limit: 12 Hz and 4 Hz. 33000 remain.
-    // rear: 33000 - 3000 = 30000, which are 5 Hz. 3000 remain.
+    // B = 96000, α = 1.5, β·B = 48000, r_min = 2, large above 1000 bytes. Standard: imu costs
+    // 150 a Hz, 40 Hz on one lane: 6000. odom costs 300 a Hz, 20 Hz on one lane and 10 Hz on
+    // the other: 9000. Both fit; 81000 remain. Large, by demand: front 3000 · 30 = 90000, rear
+    // 6000 · 8 = 48000, side 3000 · 1 = 3000. Floors: rear 6000 · 2 = 12000, side 3000 ·
+    // min(2, 1) = 3000. front: 81000 - 12000 - 3000 = 66000 is above β·B, so 48000. Up to 4 Hz
+    // both lanes cost 24000, and the other 24000 are 8 Hz more on the lane without a limit: 12
+    // Hz and 4 Hz. 33000 remain. rear: 33000 - 3000 = 30000, which are 5 Hz. 3000 remain.
     // side: 3000, which are its 1 Hz. All of the budget is used.
     let terms = Terms {
         overhead: 1.5,
@@ -735,12 +736,12 @@ fn a_worked_example_of_the_share_of_the_paper() {
 
 #[test]
 fn a_worked_example_of_the_fair_share() {
-    // B = 64000, α = 1, β·B = 32000, r_min = 2, large above 1000 bytes.
-    // Standard: imu costs 100 · 40 = 4000; 60000 remain.
-    // Large: wide has a floor of 16000 · 2 = 32000 and a limit of min(16000 · 4, β·B) = 32000: it gets 32000, 2 Hz.
-    // 28000 remain for two. slow wants 4000 · 3 = 12000, which is less than half of that: it gets all of it, 3 Hz.
-    // fast gets the other 16000, which is below its limit of 32000: up to 3 Hz both lanes cost 12000, and the other
-    // 4000 are 2 Hz more on the lane without a limit: 5 Hz and 3 Hz. All of the budget is used.
+    // B = 64000, α = 1, β·B = 32000, r_min = 2, large above 1000 bytes. Standard: imu costs 100 ·
+    // 40 = 4000; 60000 remain. Large: wide has a floor of 16000 · 2 = 32000 and a limit of
+    // min(16000 · 4, β·B) = 32000: it gets 32000, 2 Hz. 28000 remain for two. slow wants 4000 · 3 =
+    // 12000, which is less than half of that: it gets all of it, 3 Hz. fast gets the other 16000,
+    // which is below its limit of 32000: up to 3 Hz both lanes cost 12000, and the other 4000 are 2
+    // Hz more on the lane without a limit: 5 Hz and 3 Hz. All of the budget is used.
     let terms = Terms {
         overhead: 1.0,
         share: 0.5,
@@ -765,19 +766,14 @@ fn a_worked_example_of_the_fair_share() {
 
 #[test]
 fn a_worked_example_that_does_not_fit() {
-    // B = 8000, α = 1, β·B = 6000, r_min = 2, large above 1000 bytes.
-    // Standard, with all lanes: stop 10 · 100 = 1000, map 100 · 30 · 2 = 6000, tf 200 · 25 = 5000. That is 12000, above
-    // B, so the smallest demand is first, where lanes do not count: stop 1000, map 3000, tf 5000.
-    // stop gets its 1000; 7000 remain. map gets its 6000, just β·B; 1000 remain. tf gets these: 5 Hz. Nothing remains.
-    // Large: camera has its floor all the same, 2000 · 2 = 4000.
+    // B = 8000, α = 1, β·B = 6000, r_min = 2, large above 1000 bytes. Standard, with all lanes:
+    // stop 10 · 100 = 1000, map 100 · 30 · 2 = 6000, tf 200 · 25 = 5000. That is 12000, above B, so
+    // the smallest demand is first, where lanes do not count: stop 1000, map 3000, tf 5000. stop
+    // gets its 1000; 7000 remain. map gets its 6000, just β·B; 1000 remain. tf gets these: 5 Hz.
+    // Nothing remains. Large: camera has its floor all the same, 2000 · 2 = 4000.
     for sharing in [Sharing::Paper, Sharing::Fair] {
-        let terms = Terms {
-            overhead: 1.0,
-            share: 0.75,
-            min_rate_hz: 2.0,
-            large_bytes: 1_000,
-            sharing,
-        };
+        let terms =
+            Terms { overhead: 1.0, share: 0.75, min_rate_hz: 2.0, large_bytes: 1_000, sharing };
         let topics = [
             topic("/tf", 200, 25.0, &[None]),
             topic("/camera", 2_000, 10.0, &[None]),
@@ -796,10 +792,10 @@ fn a_worked_example_that_does_not_fit() {
 
 #[test]
 fn a_worked_example_of_equal_demands() {
-    // B = 10240, α = 1, β = 1, r_min = 2, large from 1 byte on. All three want 8192, two as 1024 · 8, one as 2048 · 4;
-    // the floors are 1024 · 2 = 2048 twice and 2048 · 2 = 4096.
-    // Equal demands go by the bytes of the names: "/a" is before "/a/b", and that before "/é".
-    // "/a" gets 10240 - 4096 - 2048 = 4096, 4 Hz; the others have their floors.
+    // B = 10240, α = 1, β = 1, r_min = 2, large from 1 byte on. All three want 8192, two as 1024 ·
+    // 8, one as 2048 · 4; the floors are 1024 · 2 = 2048 twice and 2048 · 2 = 4096. Equal demands
+    // go by the bytes of the names: "/a" is before "/a/b", and that before "/é". "/a" gets 10240 -
+    // 4096 - 2048 = 4096, 4 Hz; the others have their floors.
     let terms = Terms {
         overhead: 1.0,
         share: 1.0,
@@ -812,6 +808,7 @@ fn a_worked_example_of_equal_demands() {
         topic("/a/b", 2_048, 4.0, &[None]),
         topic("/a", 1_024, 8.0, &[None]),
     ];
-    let wanted: [Worked<'_>; 3] = [(2.0, &[2.0], 2_048.0), (2.0, &[2.0], 4_096.0), (4.0, &[4.0], 4_096.0)];
+    let wanted: [Worked<'_>; 3] =
+        [(2.0, &[2.0], 2_048.0), (2.0, &[2.0], 4_096.0), (4.0, &[4.0], 4_096.0)];
     assert_worked(10_240.0, &terms, &topics, &wanted, true);
 }

@@ -1,10 +1,11 @@
-//! The allocation of bandwidth worked out a second time, from the requirement alone and without rounding.
+//! The allocation of bandwidth worked out a second time, from the requirement alone and without
+//! rounding.
 //!
-//! Every number that goes in is the exact fraction that its `f64` stands for. Such fractions have powers of two as
-//! their denominators, so that one power of two is enough for all rates of a set and another for all its bytes per
-//! second: the steps are done with whole numbers in these two units. Only a rate that is cut by a bound needs a real
-//! division, and the water level of the fair share; both are kept as fractions. Nothing is ever rounded, whatever the
-//! budget and the sizes.
+//! Every number that goes in is the exact fraction that its `f64` stands for. Such fractions have
+//! powers of two as their denominators, so that one power of two is enough for all rates of a set
+//! and another for all its bytes per second: the steps are done with whole numbers in these two
+//! units. Only a rate that is cut by a bound needs a real division, and the water level of the fair
+//! share; both are kept as fractions. Nothing is ever rounded, whatever the budget and the sizes.
 
 use std::cmp::Ordering;
 
@@ -24,11 +25,13 @@ pub(crate) struct Share {
     pub(crate) lanes: Vec<BigRational>,
     /// What all lanes together cost at these rates, in bytes per second.
     pub(crate) bytes: BigRational,
-    /// What the bound is above the full demand (below it: negative), in bytes per second. At exactly 0 the rate jumps
-    /// from that of the fastest lane to the advertised one, which no lane notices.
+    /// What the bound is above the full demand (below it: negative), in bytes per second. At
+    /// exactly 0 the rate jumps from that of the fastest lane to the advertised one, which no lane
+    /// notices.
     pub(crate) spare: BigRational,
-    /// Whether the requirement leaves `r_i` open between the floor and the advertised rate: the bound is below the full
-    /// demand, but the floor is all of it. No lane is faster than the floor then, whatever `r_i` is.
+    /// Whether the requirement leaves `r_i` open between the floor and the advertised rate: the
+    /// bound is below the full demand, but the floor is all of it. No lane is faster than the floor
+    /// then, whatever `r_i` is.
     pub(crate) open: bool,
     /// Which of the limits decided.
     pub(crate) limit: Limit,
@@ -53,11 +56,13 @@ pub(crate) struct Shares {
     pub(crate) shares: Vec<Share>,
     /// Whether neither the standard demands nor the floors of large topics exceed the budget.
     pub(crate) feasible: bool,
-    /// By how much the worse of the two exceeds the budget, in bytes per second: not above 0 where the set is feasible.
+    /// By how much the worse of the two exceeds the budget, in bytes per second: not above 0 where
+    /// the set is feasible.
     pub(crate) excess: BigRational,
     /// What is allocated in all, in bytes per second.
     pub(crate) used: BigRational,
-    /// By how much the full demands of the standard topics alone exceed the budget, in bytes per second.
+    /// By how much the full demands of the standard topics alone exceed the budget, in bytes per
+    /// second.
     pub(crate) standard_excess: BigRational,
 }
 
@@ -76,10 +81,7 @@ impl Dyadic {
     /// The exact value; negative numbers and those that are none count as 0.
     fn of(value: f64) -> Self {
         if value.is_nan() || value <= 0.0 {
-            return Self {
-                mantissa: BigInt::ZERO,
-                exponent: i32::MAX,
-            };
+            return Self { mantissa: BigInt::ZERO, exponent: i32::MAX };
         }
         let (mantissa, exponent, _) = FloatCore::integer_decode(value);
         let zeros = mantissa.trailing_zeros();
@@ -117,10 +119,7 @@ struct Ratio {
 
 impl Ratio {
     fn whole(numerator: BigInt) -> Self {
-        Self {
-            numerator,
-            denominator: BigInt::from(1),
-        }
+        Self { numerator, denominator: BigInt::from(1) }
     }
 
     fn compare(&self, other: &BigInt) -> Ordering {
@@ -138,11 +137,7 @@ impl Ratio {
     }
 
     fn minimum(self, other: &BigInt) -> Self {
-        if self.compare(other).is_gt() {
-            Self::whole(other.clone())
-        } else {
-            self
-        }
+        if self.compare(other).is_gt() { Self::whole(other.clone()) } else { self }
     }
 }
 
@@ -177,13 +172,11 @@ impl Demand<'_> {
                 sum += lane * &rate.denominator;
             }
         }
-        Ratio {
-            numerator: sum * &self.price,
-            denominator: rate.denominator.clone(),
-        }
+        Ratio { numerator: sum * &self.price, denominator: rate.denominator.clone() }
     }
 
-    /// The largest rate up to `r_adv` at which all lanes together stay within a bound: none where not even 0 does.
+    /// The largest rate up to `r_adv` at which all lanes together stay within a bound: none where
+    /// not even 0 does.
     fn rate_within(&self, bound: &Ratio) -> Option<Ratio> {
         if bound.numerator.is_negative() {
             return None;
@@ -191,7 +184,8 @@ impl Demand<'_> {
         if bound.compare(&self.full).is_ge() {
             return Some(Ratio::whole(self.advertised.clone()));
         }
-        // The slowest lanes reach their own limit first; from there on only the others go on growing.
+        // The slowest lanes reach their own limit first; from there on only the others go on
+        // growing.
         let mut lanes: Vec<&BigInt> = self.lanes.iter().collect();
         lanes.sort_unstable();
         let mut reached = BigInt::ZERO;
@@ -204,10 +198,7 @@ impl Demand<'_> {
             growing -= 1;
         }
         let left = &bound.numerator - reached * &self.price * &bound.denominator;
-        Some(Ratio {
-            numerator: left,
-            denominator: &self.price * growing * &bound.denominator,
-        })
+        Some(Ratio { numerator: left, denominator: &self.price * growing * &bound.denominator })
     }
 
     /// The rate under a bound that gives way to the floor of a large topic.
@@ -238,9 +229,17 @@ struct Ledger {
 }
 
 impl Ledger {
-    /// Notes what a topic gets; returns what it costs. `rest` says whether the bound is what remains rather than the
-    /// cap.
-    fn grant(&mut self, at: usize, topic: &Demand<'_>, bound: &Ratio, rate: Ratio, floored: bool, rest: bool) -> Ratio {
+    /// Notes what a topic gets; returns what it costs. `rest` says whether the bound is what
+    /// remains rather than the cap.
+    fn grant(
+        &mut self,
+        at: usize,
+        topic: &Demand<'_>,
+        bound: &Ratio,
+        rate: Ratio,
+        floored: bool,
+        rest: bool,
+    ) -> Ratio {
         let (rates, amounts) = (self.scale.rate, self.scale.amount);
         let cost = topic.cost(&rate);
         let limit = match (floored, bound.compare(&topic.full).is_ge(), rest) {
@@ -267,10 +266,14 @@ impl Ledger {
     }
 }
 
-/// The water level `λ` at which all large topics together cost what remains, where one costs `λ`, but at least its
-/// floor and at most its limit. A level at which all have their limit is the highest of these; none where the floors
-/// exceed what remains.
-fn water_level(topics: &[(usize, &Demand<'_>)], limits: &[BigInt], remaining: &BigInt) -> Option<Ratio> {
+/// The water level `λ` at which all large topics together cost what remains, where one costs `λ`,
+/// but at least its floor and at most its limit. A level at which all have their limit is the
+/// highest of these; none where the floors exceed what remains.
+fn water_level(
+    topics: &[(usize, &Demand<'_>)],
+    limits: &[BigInt],
+    remaining: &BigInt,
+) -> Option<Ratio> {
     let at_level = |level: &BigInt| {
         let mut sum = BigInt::ZERO;
         for ((_, topic), limit) in topics.iter().zip(limits) {
@@ -297,87 +300,65 @@ fn water_level(topics: &[(usize, &Demand<'_>)], limits: &[BigInt], remaining: &B
         return Some(Ratio::whole(corner.clone()));
     }
     let left = remaining - at_level(corner);
-    Some(Ratio {
-        numerator: corner * growing + left,
-        denominator: BigInt::from(growing),
-    })
+    Some(Ratio { numerator: corner * growing + left, denominator: BigInt::from(growing) })
 }
 
 /// Brings a set into whole numbers.
-fn in_whole_numbers<'a>(budget: f64, terms: &Terms, topics: &[Topic<'a>]) -> (Scale, Vec<Demand<'a>>) {
+fn in_whole_numbers<'a>(
+    budget: f64,
+    terms: &Terms,
+    topics: &[Topic<'a>],
+) -> (Scale, Vec<Demand<'a>>) {
     let overhead = Dyadic::of(terms.overhead.max(1.0));
     let share = Dyadic::of(if terms.share > 1.0 { 1.0 } else { terms.share });
     let budget = Dyadic::of(budget);
     let floor = Dyadic::of(terms.min_rate_hz);
-    let advertised: Vec<Dyadic> = topics.iter().map(|topic| Dyadic::of(topic.advertised_hz)).collect();
+    let advertised: Vec<Dyadic> =
+        topics.iter().map(|topic| Dyadic::of(topic.advertised_hz)).collect();
     let lanes: Vec<Vec<Option<Dyadic>>> = topics
         .iter()
-        .map(|topic| {
-            topic
-                .lanes
-                .iter()
-                .map(|lane| lane.max_rate_hz.map(Dyadic::of))
-                .collect()
-        })
+        .map(|topic| topic.lanes.iter().map(|lane| lane.max_rate_hz.map(Dyadic::of)).collect())
         .collect();
 
-    let all_rates = advertised
-        .iter()
-        .chain(lanes.iter().flatten().flatten())
-        .chain([&floor]);
-    let rate = all_rates
-        .map(|rate| rate.exponent)
-        .min()
-        .map_or(0, |least| least.min(0));
-    let amounts = [
-        rate + overhead.exponent,
-        budget.exponent,
-        budget.exponent.saturating_add(share.exponent),
-    ];
+    let all_rates = advertised.iter().chain(lanes.iter().flatten().flatten()).chain([&floor]);
+    let rate = all_rates.map(|rate| rate.exponent).min().map_or(0, |least| least.min(0));
+    let amounts =
+        [rate + overhead.exponent, budget.exponent, budget.exponent.saturating_add(share.exponent)];
     let amount = amounts.into_iter().min().map_or(0, |least| least.min(0));
 
     let cap = Dyadic {
         mantissa: &budget.mantissa * &share.mantissa,
         exponent: budget.exponent.saturating_add(share.exponent),
     };
-    let scale = Scale {
-        rate,
-        amount,
-        budget: budget.in_units(amount),
-        cap: cap.in_units(amount),
-    };
+    let scale = Scale { rate, amount, budget: budget.in_units(amount), cap: cap.in_units(amount) };
 
     let unit_price = overhead.in_units(amount - rate);
     let floor = floor.in_units(rate);
-    let demands = topics
-        .iter()
-        .zip(advertised)
-        .zip(lanes)
-        .map(|((topic, advertised), lanes)| {
-            let advertised = advertised.in_units(rate);
-            let lanes: Vec<BigInt> = lanes
-                .into_iter()
-                .map(|lane| {
-                    lane.map_or_else(
-                        || advertised.clone(),
-                        |most| most.in_units(rate).min(advertised.clone()),
-                    )
-                })
-                .collect();
-            let price = &unit_price * topic.size_bytes;
-            let floor_rate = floor.clone().min(advertised.clone());
-            Demand {
-                name: topic.name.as_bytes(),
-                large: topic.size_bytes > terms.large_bytes,
-                demand: &advertised * &price,
-                full: lanes.iter().sum::<BigInt>() * &price,
-                floor: lanes.iter().map(|lane| lane.min(&floor_rate)).sum::<BigInt>() * &price,
-                advertised,
-                lanes,
-                price,
-                floor_rate,
-            }
-        });
+    let demands = topics.iter().zip(advertised).zip(lanes).map(|((topic, advertised), lanes)| {
+        let advertised = advertised.in_units(rate);
+        let lanes: Vec<BigInt> = lanes
+            .into_iter()
+            .map(|lane| {
+                lane.map_or_else(
+                    || advertised.clone(),
+                    |most| most.in_units(rate).min(advertised.clone()),
+                )
+            })
+            .collect();
+        let price = &unit_price * topic.size_bytes;
+        let floor_rate = floor.clone().min(advertised.clone());
+        Demand {
+            name: topic.name.as_bytes(),
+            large: topic.size_bytes > terms.large_bytes,
+            demand: &advertised * &price,
+            full: lanes.iter().sum::<BigInt>() * &price,
+            floor: lanes.iter().map(|lane| lane.min(&floor_rate)).sum::<BigInt>() * &price,
+            advertised,
+            lanes,
+            price,
+            floor_rate,
+        }
+    });
     (scale, demands.collect())
 }
 
@@ -385,21 +366,17 @@ fn in_whole_numbers<'a>(budget: f64, terms: &Terms, topics: &[Topic<'a>]) -> (Sc
 pub(crate) fn exact(budget: f64, terms: &Terms, topics: &[Topic<'_>]) -> Shares {
     let (scale, demands) = in_whole_numbers(budget, terms, topics);
     let (budget, cap, amount) = (scale.budget.clone(), scale.cap.clone(), scale.amount);
-    let (mut large, mut standard): (Vec<_>, Vec<_>) = demands.iter().enumerate().partition(|(_, topic)| topic.large);
-    let mut ledger = Ledger {
-        scale,
-        shares: topics.iter().map(|_| None).collect(),
-    };
+    let (mut large, mut standard): (Vec<_>, Vec<_>) =
+        demands.iter().enumerate().partition(|(_, topic)| topic.large);
+    let mut ledger = Ledger { scale, shares: topics.iter().map(|_| None).collect() };
 
-    // Standard topics come first: largest demand first where all of them fit, smallest first where they do not.
+    // Standard topics come first: largest demand first where all of them fit, smallest first where
+    // they do not.
     let wanted: BigInt = standard.iter().map(|(_, topic)| &topic.full).sum();
     let standard_exceeds = wanted > budget;
     standard.sort_unstable_by(|(_, a), (_, b)| {
-        let by_demand = if standard_exceeds {
-            a.demand.cmp(&b.demand)
-        } else {
-            b.demand.cmp(&a.demand)
-        };
+        let by_demand =
+            if standard_exceeds { a.demand.cmp(&b.demand) } else { b.demand.cmp(&a.demand) };
         by_demand.then_with(|| a.name.cmp(b.name))
     });
     let one = BigInt::from(1);
@@ -415,7 +392,9 @@ pub(crate) fn exact(budget: f64, terms: &Terms, topics: &[Topic<'_>]) -> Shares 
     }
 
     // Large topics share what remains and keep their floors.
-    large.sort_unstable_by(|(_, a), (_, b)| b.demand.cmp(&a.demand).then_with(|| a.name.cmp(b.name)));
+    large.sort_unstable_by(|(_, a), (_, b)| {
+        b.demand.cmp(&a.demand).then_with(|| a.name.cmp(b.name))
+    });
     let floors: BigInt = large.iter().map(|(_, topic)| &topic.floor).sum();
     let standard_excess = wanted - &budget;
     let excess = standard_excess.clone().max(&used.numerator + &floors - &budget);
@@ -434,11 +413,10 @@ pub(crate) fn exact(budget: f64, terms: &Terms, topics: &[Topic<'_>]) -> Shares 
             }
         }
         Sharing::Fair => {
-            let limits: Vec<BigInt> = large
-                .iter()
-                .map(|(_, topic)| topic.full.clone().min(cap.clone()))
-                .collect();
-            let level = water_level(&large, &limits, &remaining).unwrap_or_else(|| Ratio::whole(BigInt::from(-1)));
+            let limits: Vec<BigInt> =
+                large.iter().map(|(_, topic)| topic.full.clone().min(cap.clone())).collect();
+            let level = water_level(&large, &limits, &remaining)
+                .unwrap_or_else(|| Ratio::whole(BigInt::from(-1)));
             used = Ratio {
                 numerator: used.numerator * &level.denominator,
                 denominator: level.denominator.clone(),

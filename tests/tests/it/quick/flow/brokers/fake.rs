@@ -1,4 +1,5 @@
-//! A broker with a server outside of the flow: messages in a memory hub, leases in a map that outlives flows.
+//! A broker with a server outside of the flow: messages in a memory hub, leases in a map that
+//! outlives flows.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -7,8 +8,8 @@ use std::time::Instant;
 use async_trait::async_trait;
 use blaze_brokers::memory::{MemoryBroker, MemoryHub};
 use blaze_brokers::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
-    PublisherOptions, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome,
+    Publisher, PublisherOptions, SubscribeOptions, Subscription,
 };
 use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
@@ -41,11 +42,7 @@ struct State {
 
 impl Server {
     pub(crate) fn new(kind: BrokerKind) -> Self {
-        Self {
-            hub: MemoryHub::new(kind.as_str()),
-            kind,
-            state: Arc::default(),
-        }
+        Self { hub: MemoryHub::new(kind.as_str()), kind, state: Arc::default() }
     }
 
     /// A flow's connection.
@@ -55,11 +52,7 @@ impl Server {
         Arc::new(FakeBroker {
             server: self.clone(),
             inner,
-            side: Arc::new(Side {
-                server: self.clone(),
-                status,
-                standing_back: Mutex::default(),
-            }),
+            side: Arc::new(Side { server: self.clone(), status, standing_back: Mutex::default() }),
         })
     }
 
@@ -69,10 +62,7 @@ impl Server {
     }
 
     pub(crate) fn put_lease(&self, key: &str, value: &str) {
-        self.state
-            .lock()
-            .leases
-            .insert(key.to_owned(), Bytes::from(value.to_owned()));
+        self.state.lock().leases.insert(key.to_owned(), Bytes::from(value.to_owned()));
     }
 
     /// How often a lease was put or removed.
@@ -156,7 +146,11 @@ impl Broker for FakeBroker {
         self.side.status.subscribe()
     }
 
-    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError> {
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError> {
         let mut state = self.server.state.lock();
         if let Some(error) = state.refused.get(channel.as_str()) {
             return Err(error.clone());
@@ -170,7 +164,11 @@ impl Broker for FakeBroker {
         }))
     }
 
-    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
         self.inner.subscribe(channel, options).await
     }
 
@@ -243,12 +241,6 @@ impl Publisher for FakePublisher {
     }
 
     fn later(&self) -> Later {
-        self.server
-            .state
-            .lock()
-            .later
-            .get(&self.channel)
-            .copied()
-            .unwrap_or_default()
+        self.server.state.lock().later.get(&self.channel).copied().unwrap_or_default()
     }
 }

@@ -1,5 +1,5 @@
-//! A whole flow with brokers that have a server: leases that outlive it, scopes that are another's, writers that fail and
-//! messages that are dropped after they were taken.
+//! A whole flow with brokers that have a server: leases that outlive it, scopes that are another's,
+//! writers that fail and messages that are dropped after they were taken.
 
 mod fake;
 
@@ -9,7 +9,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Broker, BrokerKind, Content, Health, Later, PublishOutcome, PublisherOptions, Received, SubscribeOptions,
+    Broker, BrokerKind, Content, Health, Later, PublishOutcome, PublisherOptions, Received,
+    SubscribeOptions,
 };
 use blaze_domain::LayerKind;
 use blaze_domain::names::ChannelName;
@@ -54,12 +55,7 @@ impl Node {
             state_dir: None,
         };
         let flow = blaze_flow::flow::start(options, supervisor.clone()).await.unwrap();
-        Self {
-            flow,
-            supervisor,
-            node,
-            layer,
-        }
+        Self { flow, supervisor, node, layer }
     }
 
     async fn started(me: &str, node: &Server, layer: &Server) -> Self {
@@ -93,10 +89,7 @@ impl Node {
         let why = self.get(&format!("/v1/why?topic={topic}"));
         let failing = why["steps"].as_array().unwrap().iter().find(|step| step["ok"] == false);
         let detail = failing.map_or(Value::Null, |step| step["detail"].clone());
-        (
-            why["code"].as_str().unwrap().to_owned(),
-            detail.as_str().unwrap_or_default().to_owned(),
-        )
+        (why["code"].as_str().unwrap().to_owned(), detail.as_str().unwrap_or_default().to_owned())
     }
 
     fn bridges(&self) -> Vec<Value> {
@@ -105,7 +98,9 @@ impl Node {
 
     /// `id state` of each bridge.
     fn ways(&self) -> Vec<String> {
-        let text = |row: &Value| format!("{} {}", row["id"].as_str().unwrap(), row["state"].as_str().unwrap());
+        let text = |row: &Value| {
+            format!("{} {}", row["id"].as_str().unwrap(), row["state"].as_str().unwrap())
+        };
         self.bridges().iter().map(text).collect()
     }
 }
@@ -121,9 +116,8 @@ async fn until(what: &str, mut holds: impl FnMut() -> bool) {
 
 fn send(server: &Server, channel: &str, payload: impl Into<Bytes>) {
     let client = server.hub.broker();
-    let publisher = client
-        .publisher(&channel.parse().unwrap(), PublisherOptions::default())
-        .unwrap();
+    let publisher =
+        client.publisher(&channel.parse().unwrap(), PublisherOptions::default()).unwrap();
     assert_eq!(publisher.publish_bare(&payload.into(), None), PublishOutcome::Taken);
 }
 
@@ -145,9 +139,7 @@ async fn make_route(node: &Node, of_node: &Server, of_layer: &Server, topic: &st
 
 async fn receive(subscription: &mut blaze_brokers::Subscription) -> Received {
     let mut batch = Vec::new();
-    tokio::time::timeout(DEADLINE, subscription.receive(&mut batch, 1))
-        .await
-        .unwrap();
+    tokio::time::timeout(DEADLINE, subscription.receive(&mut batch, 1)).await.unwrap();
     batch.remove(0)
 }
 
@@ -158,10 +150,7 @@ async fn leases_survive_a_restart_of_the_flow() {
     make_route(&first, &redis, &kafka, "imu/data").await;
     control(&redis, &lease("request", "gone"));
     control(&redis, &lease("withdraw", "gone"));
-    until("the leases are kept", || {
-        redis.leases().len() == 1 && kafka.leases().len() == 1
-    })
-    .await;
+    until("the leases are kept", || redis.leases().len() == 1 && kafka.leases().len() == 1).await;
     assert_eq!(kafka.leases().keys().next().unwrap(), "request|imu/data|fog||svc|0");
     assert!(kafka.channels().contains("imu/data"));
     until("what was withdrawn is not kept", || redis.writes() == 3).await;
@@ -185,10 +174,8 @@ async fn leases_survive_a_restart_of_the_flow() {
     assert!(second.ways().is_empty());
     redis.set_mute(false);
     tokio::time::timeout(DEADLINE, second.flow.ready()).await.unwrap();
-    until("nobody said anything and it flows", || {
-        second.ways() == ["imu/data|node>layer|fog up"]
-    })
-    .await;
+    until("nobody said anything and it flows", || second.ways() == ["imu/data|node>layer|fog up"])
+        .await;
     let metrics = second.get("/metrics").to_string();
     assert!(
         metrics.contains("blaze_flow_link_events_total{event=\\\"kept_lease_skipped\\\"} 1"),
@@ -206,10 +193,7 @@ async fn leases_survive_a_restart_of_the_flow() {
     let Content::Frame(frame) = receive(&mut subscription).await.content else {
         panic!("a flow writes frames to Kafka");
     };
-    assert_eq!(
-        (frame.hops(), frame.origin_service(), frame.origin_instance()),
-        (1, "svc", "0")
-    );
+    assert_eq!((frame.hops(), frame.origin_service(), frame.origin_instance()), (1, "svc", "0"));
     second.end().await;
 }
 
@@ -244,8 +228,7 @@ async fn a_scope_of_another_flow_is_told_and_not_bridged() {
     let (redis, kafka) = (Server::new(BrokerKind::Redis), Server::new(BrokerKind::Kafka));
     let node = Node::started("fog/fog-1", &redis, &kafka).await;
     make_route(&node, &redis, &kafka, "imu/data").await;
-    node.node
-        .set_health(Health::InUse, "scope_in_use: edge/robot-7 holds it");
+    node.node.set_health(Health::InUse, "scope_in_use: edge/robot-7 holds it");
     until("the bridge ends", || node.ways().is_empty()).await;
     until("/readyz says whose it is", || {
         node.check("node_broker") == ("failed".into(), "scope_in_use: edge/robot-7 holds it".into())
@@ -301,10 +284,7 @@ async fn a_bridge_without_a_writer_has_failed_and_is_tried_again() {
     assert_eq!(code, "bridge_failed");
     assert!(detail.contains("no such names"), "{detail}");
     let metrics = node.get("/metrics").to_string();
-    assert!(
-        metrics.contains("blaze_flow_bridges{state=\\\"failed\\\"} 1"),
-        "{metrics}"
-    );
+    assert!(metrics.contains("blaze_flow_bridges{state=\\\"failed\\\"} 1"), "{metrics}");
     kafka.refuse("imu/data", false);
     until("it works", || node.ways() == ["imu/data|node>layer|fog up"]).await;
     node.end().await;
@@ -315,12 +295,7 @@ async fn what_a_broker_drops_later_is_counted_and_explained() {
     let (redis, kafka) = (Server::new(BrokerKind::Redis), Server::new(BrokerKind::Kafka));
     let node = Node::started("fog/fog-1", &redis, &kafka).await;
     make_route(&node, &redis, &kafka, "camera").await;
-    let later = Later {
-        queued: 3,
-        too_large: 2,
-        lifespan: 1,
-        ..Later::default()
-    };
+    let later = Later { queued: 3, too_large: 2, lifespan: 1, ..Later::default() };
     kafka.set_later("camera", later);
     for _ in 0..10 {
         send(&redis, "camera", vec![7; 1000]);
@@ -346,29 +321,31 @@ async fn what_a_broker_drops_later_is_counted_and_explained() {
     };
     assert_eq!(counts(), (10, 4, 4000, 3));
     until("too large", || node.why("camera").0 == "too_large").await;
-    kafka.set_later(
-        "camera",
-        Later {
-            queued: 0,
-            too_large: 5,
-            ..later
-        },
-    );
+    kafka.set_later("camera", Later { queued: 0, too_large: 5, ..later });
     assert_eq!(counts(), (10, 4, 4000, 0));
 
     // A plan that is made anew keeps the writer, and its account.
     control(
         &kafka,
-        &json!({"op": "request", "topic": "camera", "service": "other", "max_rate_hz": 1000, "ttl_s": 60}),
+        &json!({
+            "op": "request",
+            "topic": "camera",
+            "service": "other",
+            "max_rate_hz": 1000,
+            "ttl_s": 60,
+        }),
     );
     control(
         &kafka,
-        &json!({"op": "request", "topic": "camera", "service": "svc", "max_rate_hz": 1000, "ttl_s": 60}),
+        &json!({
+            "op": "request",
+            "topic": "camera",
+            "service": "svc",
+            "max_rate_hz": 1000,
+            "ttl_s": 60,
+        }),
     );
-    until("the lane has the new rate", || {
-        node.bridges()[0]["max_rate_hz"] == 1000.0
-    })
-    .await;
+    until("the lane has the new rate", || node.bridges()[0]["max_rate_hz"] == 1000.0).await;
     assert_eq!(kafka.publishers("camera"), 1);
     assert_eq!(counts(), (10, 4, 4000, 0));
     node.end().await;

@@ -70,9 +70,7 @@ impl Publisher for ScopeWriter {
         }
         scope.delivered.push(key);
         // What a flow writes comes back to it, as on Redis.
-        scope
-            .pending
-            .push(((&self.topic).into(), Content::from_bytes(frame.to_bytes())));
+        scope.pending.push(((&self.topic).into(), Content::from_bytes(frame.to_bytes())));
         PublishOutcome::Taken
     }
     fn publish_bare(&self, _payload: &Bytes, _: Option<Instant>) -> PublishOutcome {
@@ -148,11 +146,9 @@ impl<'a> Simulation<'a> {
         };
         for index in 0..count {
             let id: FlowId = format!("layer-{index}/node-{index}").parse().unwrap();
-            let scopes: BTreeMap<Scope, ScopeBroker> = [
-                (Scope::Node, ScopeBroker::default()),
-                (Scope::Layer, ScopeBroker::default()),
-            ]
-            .into();
+            let scopes: BTreeMap<Scope, ScopeBroker> =
+                [(Scope::Node, ScopeBroker::default()), (Scope::Layer, ScopeBroker::default())]
+                    .into();
             simulation.scopes.push(scopes);
             let flow = simulation.make_flow(index, id, 1);
             simulation.flows.push(flow);
@@ -200,18 +196,8 @@ impl<'a> Simulation<'a> {
             limits: Limits::default(),
         };
         let engine = Engine::new(engine_config, self.now, self.wall());
-        let plane = PlaneState {
-            core,
-            engine: Some(engine),
-        };
-        Flow {
-            id,
-            epoch,
-            alive: true,
-            control,
-            plane,
-            subscribed: BTreeSet::new(),
-        }
+        let plane = PlaneState { core, engine: Some(engine) };
+        Flow { id, epoch, alive: true, control, plane, subscribed: BTreeSet::new() }
     }
 
     fn add_service(&mut self, number: usize) {
@@ -221,11 +207,7 @@ impl<'a> Simulation<'a> {
         self.random.fill(&mut writer);
         let service = Service {
             flow,
-            scope: if self.random.random_bool(0.5) {
-                Scope::Node
-            } else {
-                Scope::Layer
-            },
+            scope: if self.random.random_bool(0.5) { Scope::Node } else { Scope::Layer },
             name: format!("service-{number}"),
             topic,
             publishes: self.random.random_bool(0.5),
@@ -295,9 +277,21 @@ impl<'a> Simulation<'a> {
         }
         let message = if service.publishes {
             let reliability = if service.reliable { "reliable" } else { "best_effort" };
-            json!({"op": "advertise", "topic": service.topic.as_str(), "service": service.name, "ttl_s": 0, "reliability": reliability})
+            json!({
+                "op": "advertise",
+                "topic": service.topic.as_str(),
+                "service": service.name,
+                "ttl_s": 0,
+                "reliability": reliability,
+            })
         } else {
-            json!({"op": "request", "topic": service.topic.as_str(), "service": service.name, "ttl_s": 0, "reliability": "reliable"})
+            json!({
+                "op": "request",
+                "topic": service.topic.as_str(),
+                "service": service.name,
+                "ttl_s": 0,
+                "reliability": "reliable",
+            })
         };
         self.send_control(index, &message);
     }
@@ -307,8 +301,7 @@ impl<'a> Simulation<'a> {
         let wall_ms = self.wall() / 1_000_000;
         let flow = &mut self.flows[service.flow];
         if flow.alive {
-            flow.control
-                .control(self.now, wall_ms, service.scope, message.to_string().as_bytes());
+            flow.control.control(self.now, wall_ms, service.scope, message.to_string().as_bytes());
         }
     }
 
@@ -336,7 +329,11 @@ impl<'a> Simulation<'a> {
                 self.lease(index);
             } else {
                 let service = &self.services[index];
-                let withdraw = json!({"op": "withdraw", "topic": service.topic.as_str(), "service": service.name});
+                let withdraw = json!({
+                    "op": "withdraw",
+                    "topic": service.topic.as_str(),
+                    "service": service.name,
+                });
                 self.send_control(index, &withdraw);
                 self.services[index].active = false;
             }
@@ -358,7 +355,10 @@ impl<'a> Simulation<'a> {
 
     fn publish_some(&mut self, chance: f64) {
         for index in 0..self.services.len() {
-            if self.services[index].publishes && self.services[index].active && self.random.random_bool(chance) {
+            if self.services[index].publishes
+                && self.services[index].active
+                && self.random.random_bool(chance)
+            {
                 let bytes = if self.random.random_bool(0.05) { 20_000 } else { 100 };
                 self.publish(index, bytes);
             }
@@ -386,10 +386,7 @@ impl<'a> Simulation<'a> {
         };
         let frame = Frame::new(&header, Bytes::from(vec![7; bytes])).unwrap();
         let scope = &self.scopes[service.flow][&service.scope];
-        scope
-            .lock()
-            .pending
-            .push(((&service.topic).into(), Content::Frame(frame)));
+        scope.lock().pending.push(((&service.topic).into(), Content::Frame(frame)));
         service.sequence
     }
 
@@ -425,16 +422,17 @@ impl<'a> Simulation<'a> {
     fn discover(&mut self) {
         for a in 0..self.flows.len() {
             for b in 0..self.flows.len() {
-                let joined =
-                    a != b && self.flows[a].alive && self.flows[b].alive && self.joined(a, b) && self.joined(b, a);
+                let joined = a != b
+                    && self.flows[a].alive
+                    && self.flows[b].alive
+                    && self.joined(a, b)
+                    && self.joined(b, a);
                 let epoch = self.flows[b].epoch;
                 let life = self.flows[a].epoch * 1_000_000 + epoch;
-                if joined && self.known.get(&(a, b)) != Some(&life) && self.random.random_bool(0.05) {
+                if joined && self.known.get(&(a, b)) != Some(&life) && self.random.random_bool(0.05)
+                {
                     self.known.insert((a, b), life);
-                    let endpoint = Endpoint {
-                        flow: self.flows[b].id.clone(),
-                        epoch,
-                    };
+                    let endpoint = Endpoint { flow: self.flows[b].id.clone(), epoch };
                     let now = self.now;
                     if let Some(engine) = &mut self.flows[a].plane.engine {
                         engine.peer_discovered(now, endpoint);
@@ -477,13 +475,8 @@ impl<'a> Simulation<'a> {
                 let Some(id) = flow.plane.core.find(topic.as_str()) else {
                     continue;
                 };
-                let mut batch = vec![Received {
-                    content,
-                    at: now,
-                    broker_age_us: 0,
-                    kept: false,
-                    place: None,
-                }];
+                let mut batch =
+                    vec![Received { content, at: now, broker_age_us: 0, kept: false, place: None }];
                 flow.plane.ingest(now, wall, id, *scope, &mut batch);
             }
         }
@@ -563,11 +556,8 @@ impl<'a> Simulation<'a> {
             if self.cut.contains(&(index, to)) || self.random.random_bool(loss) {
                 continue;
             }
-            let copies = if !self.calm && loss > 0.0 && self.random.random_bool(0.02) {
-                2
-            } else {
-                1
-            };
+            let copies =
+                if !self.calm && loss > 0.0 && self.random.random_bool(0.02) { 2 } else { 1 };
             for _ in 0..copies {
                 let jitter = self.jitter.mul_f64(self.random.random());
                 let packet = Packet {
@@ -591,7 +581,8 @@ impl<'a> Simulation<'a> {
             for (scope, broker) in scopes {
                 if let Some((topic, writer, sequence)) = broker.lock().twice.first() {
                     return Err(format!(
-                        "{topic} {writer} {sequence} was written twice into {scope} of layer-{index}"
+                        "{topic} {writer} {sequence} was written twice into {scope} of \
+                         layer-{index}"
                     ));
                 }
             }
@@ -608,24 +599,22 @@ impl<'a> Simulation<'a> {
         counts.collect()
     }
 
-    fn everybody_has(&self, sent: &[(usize, u64)], before: &HashMap<(usize, Scope), usize>) -> Result<usize, String> {
+    fn everybody_has(
+        &self,
+        sent: &[(usize, u64)],
+        before: &HashMap<(usize, Scope), usize>,
+    ) -> Result<usize, String> {
         let mut expected: BTreeMap<(usize, Scope), BTreeSet<Delivered>> = BTreeMap::new();
         let mut wanted: BTreeMap<(usize, Scope), BTreeSet<&TopicName>> = BTreeMap::new();
-        for request in self
-            .services
-            .iter()
-            .filter(|service| service.active && !service.publishes)
-        {
-            wanted
-                .entry((request.flow, request.scope))
-                .or_default()
-                .insert(&request.topic);
+        for request in self.services.iter().filter(|service| service.active && !service.publishes) {
+            wanted.entry((request.flow, request.scope)).or_default().insert(&request.topic);
         }
         for (place, topics) in &wanted {
             for (publisher, sequence) in sent {
                 let publisher = &self.services[*publisher];
                 // On its own scope a service hears the publisher without a flow.
-                if (publisher.flow, publisher.scope) != *place && topics.contains(&publisher.topic) {
+                if (publisher.flow, publisher.scope) != *place && topics.contains(&publisher.topic)
+                {
                     let key = (publisher.topic.clone(), publisher.writer, *sequence);
                     expected.entry(*place).or_default().insert(key);
                 }
@@ -646,10 +635,10 @@ impl<'a> Simulation<'a> {
                         self.describe()
                     ));
                 }
-                let fresh: BTreeSet<_> = sent.iter().map(|(s, n)| (self.services[*s].writer, *n)).collect();
-                let needless = got
-                    .iter()
-                    .find(|key| fresh.contains(&(key.1, key.2)) && !want.contains(*key));
+                let fresh: BTreeSet<_> =
+                    sent.iter().map(|(s, n)| (self.services[*s].writer, *n)).collect();
+                let needless =
+                    got.iter().find(|key| fresh.contains(&(key.1, key.2)) && !want.contains(*key));
                 if let Some(needless) = needless {
                     return Err(format!(
                         "{needless:?} reached {scope} of layer-{index} and nobody asked for it"

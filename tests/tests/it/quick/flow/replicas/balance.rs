@@ -1,4 +1,5 @@
-//! Topics of unequal weight move between replicas by measured load, and no message is lost, repeated or overtaken by that.
+//! Topics of unequal weight move between replicas by measured load, and no message is lost,
+//! repeated or overtaken by that.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -42,7 +43,8 @@ struct Became {
 }
 
 impl World {
-    /// One replica carries everything; the others have only just come. Also the repeats that came of that.
+    /// One replica carries everything; the others have only just come. Also the repeats that came
+    /// of that.
     fn skewed(seed: u64, replicas: usize) -> (Self, u64) {
         let mut world = Self::loaded(seed, replicas, &STREAMS);
         for index in 2..=replicas {
@@ -64,11 +66,8 @@ impl World {
             while stream.next <= self.now {
                 stream.next += stream.period;
                 stream.sent += 1;
-                let origin = Origin {
-                    layer: "cloud".into(),
-                    service: "s".into(),
-                    ..Origin::default()
-                };
+                let origin =
+                    Origin { layer: "cloud".into(), service: "s".into(), ..Origin::default() };
                 let writer = WriterId([100 + number as u8; 16]);
                 let header = Header {
                     reliable: true,
@@ -164,12 +163,7 @@ impl World {
     fn run_until(&mut self, most: Duration, what: &str, is_so: impl Fn(&Self) -> bool) -> Duration {
         let begin = self.now;
         while !is_so(self) {
-            assert!(
-                self.now - begin < most,
-                "{what}: {:?} {:?}",
-                self.carried(),
-                self.loads()
-            );
+            assert!(self.now - begin < most, "{what}: {:?} {:?}", self.carried(), self.loads());
             self.run_for(Duration::from_millis(5));
         }
         self.now - begin
@@ -193,19 +187,13 @@ fn skewed_loads_become_even_and_stay_so() {
     for seed in seeds() {
         for replicas in [2, 3] {
             let (mut world, repeats) = World::skewed(seed, replicas);
-            let nothing = Became {
-                repeats,
-                ..Became::default()
-            };
+            let nothing = Became { repeats, ..Became::default() };
             let took = world.run_until(120 * SECOND, "it never gets even", |world| {
                 world.carried().values().sum::<usize>() == STREAMS.len() && is_even(&world.loads())
             });
             let (moves, loads) = (world.moves(), world.loads());
             println!("seed {seed}, {replicas} replicas: {moves} moves in {took:?}: {loads:?}");
-            assert!(
-                moves >= 2 && moves as usize <= STREAMS.len(),
-                "seed {seed}: {moves} moves"
-            );
+            assert!(moves >= 2 && moves as usize <= STREAMS.len(), "seed {seed}: {moves} moves");
             world.run_for(90 * SECOND);
             assert_eq!((world.moves(), world.loads()), (moves, loads), "seed {seed}: it stays");
             assert_eq!(world.finish(), nothing, "seed {seed}, {replicas} replicas");
@@ -213,7 +201,8 @@ fn skewed_loads_become_even_and_stay_so() {
     }
 }
 
-/// One end of a move dies when nothing more is read, or when the other end has been told where to begin.
+/// One end of a move dies when nothing more is read, or when the other end has been told where to
+/// begin.
 fn dies_in_the_middle(of_giver: bool, told: bool) {
     let mut repeats = 0;
     for seed in seeds() {
@@ -223,38 +212,21 @@ fn dies_in_the_middle(of_giver: bool, told: bool) {
         let moved = world.moves();
         world.run_until(60 * SECOND, "nothing is ever moved", |world| {
             let giver = &world.flows[1].control;
-            if told {
-                giver.moves().by_load > moved
-            } else {
-                !giver.emptying().is_empty()
-            }
+            if told { giver.moves().by_load > moved } else { !giver.emptying().is_empty() }
         });
         let victim = if of_giver { 1 } else { world.given_to(1) };
         world.end_now(victim, End::Killed);
         let alive: Vec<usize> = (1..=3).filter(|index| *index != victim).collect();
         world.run_for(6 * SECOND);
         let carried = world.carried();
-        assert_eq!(
-            carried.values().sum::<usize>(),
-            STREAMS.len(),
-            "seed {seed}: {carried:?}"
-        );
-        assert!(
-            carried.keys().all(|index| alive.contains(index)),
-            "seed {seed}: {carried:?}"
-        );
+        assert_eq!(carried.values().sum::<usize>(), STREAMS.len(), "seed {seed}: {carried:?}");
+        assert!(carried.keys().all(|index| alive.contains(index)), "seed {seed}: {carried:?}");
         let became = world.finish();
         repeats += became.repeats - before;
-        let nothing_lost = Became {
-            repeats: became.repeats,
-            ..Became::default()
-        };
+        let nothing_lost = Became { repeats: became.repeats, ..Became::default() };
         assert_eq!(became, nothing_lost, "seed {seed}, giver {of_giver}, told {told}");
         if !of_giver {
-            assert_eq!(
-                became.repeats, before,
-                "seed {seed}: the one that got it had sent nothing"
-            );
+            assert_eq!(became.repeats, before, "seed {seed}: the one that got it had sent nothing");
         }
     }
     println!("giver {of_giver}, told {told}: {repeats} repeats were dropped on the way");
@@ -294,7 +266,8 @@ fn over_a_slow_link_nothing_moves() {
     assert_eq!((became.lost, became.twice), (0, 0), "{became:?}");
 }
 
-/// What is on its way when a topic is to go is acknowledged too late: the topic stays, and goes on where it stopped.
+/// What is on its way when a topic is to go is acknowledged too late: the topic stays, and goes on
+/// where it stopped.
 #[test]
 fn a_move_that_takes_too_long_is_taken_back() {
     for seed in seeds() {
@@ -316,10 +289,7 @@ fn a_move_that_takes_too_long_is_taken_back() {
             world.run_for(SECOND);
             assert_eq!(world.carried().values().sum::<usize>(), STREAMS.len(), "seed {seed}");
         }
-        let nothing = Became {
-            repeats: before,
-            ..Became::default()
-        };
+        let nothing = Became { repeats: before, ..Became::default() };
         assert_eq!(world.finish(), nothing, "seed {seed}");
     }
 }
@@ -340,11 +310,7 @@ fn moves_and_ends_of_replicas_go_together() {
         }
         world.run_for(8 * SECOND);
         let carried = world.carried();
-        assert_eq!(
-            carried.values().sum::<usize>(),
-            STREAMS.len(),
-            "seed {seed}: {carried:?}"
-        );
+        assert_eq!(carried.values().sum::<usize>(), STREAMS.len(), "seed {seed}: {carried:?}");
         // Where each flow ends again before it has settled, nothing may move.
         moved += usize::from(world.moves() > 0);
         worlds += 1;

@@ -10,8 +10,8 @@ use super::world::World;
 
 const SECOND: Duration = Duration::from_secs(1);
 
-/// A replica that comes back gets its topics again after a few seconds. What the other one had for Kafka by then is written before
-/// anything that comes after it, however long that takes.
+/// A replica that comes back gets its topics again after a few seconds. What the other one had for
+/// Kafka by then is written before anything that comes after it, however long that takes.
 #[test]
 fn what_waits_for_kafka_is_not_overtaken_by_what_goes_to_another_replica() {
     let mut moved = 0;
@@ -45,8 +45,9 @@ fn what_waits_for_kafka_is_not_overtaken_by_what_goes_to_another_replica() {
     assert!(moved > 0, "no topic ever moved in such a pause");
 }
 
-/// A carrier's reader stands still although what the flow says gets through, and then the flow falls silent, too. Who takes over begins
-/// where that one had stopped reading, not where it was last heard.
+/// A carrier's reader stands still although what the flow says gets through, and then the flow
+/// falls silent, too. Who takes over begins where that one had stopped reading, not where it was
+/// last heard.
 #[test]
 fn what_a_carrier_had_not_read_before_it_fell_silent_is_taken_over() {
     for seed in seeds() {

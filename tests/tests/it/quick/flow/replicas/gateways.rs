@@ -1,5 +1,5 @@
-//! A layer with more flows than are on the inter scope: gateways are chosen, replaced and given up, and services on the nodes
-//! of the others reach a robot outside, and it them, all the while.
+//! A layer with more flows than are on the inter scope: gateways are chosen, replaced and given up,
+//! and services on the nodes of the others reach a robot outside, and it them, all the while.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -29,10 +29,7 @@ impl World {
 
     fn gateways(&self) -> Vec<usize> {
         let stages = self.stages().into_iter();
-        stages
-            .filter(|(_, stage)| *stage == Stage::Gateway)
-            .map(|(index, _)| index)
-            .collect()
+        stages.filter(|(_, stage)| *stage == Stage::Gateway).map(|(index, _)| index).collect()
     }
 
     /// Flows of the cloud that the robot hears.
@@ -44,13 +41,8 @@ impl World {
     /// How often flows wrote a message to a channel, by writer and sequence.
     fn on_channel(&self, index: usize, topic: &str) -> BTreeMap<(WriterId, u64), usize> {
         let mut counts = BTreeMap::new();
-        for record in self
-            .redis
-            .log
-            .lock()
-            .get(&channel(index, Scope::Node, topic))
-            .into_iter()
-            .flatten()
+        for record in
+            self.redis.log.lock().get(&channel(index, Scope::Node, topic)).into_iter().flatten()
         {
             if let Content::Frame(frame) = &record.content
                 && frame.hops() > 0
@@ -115,16 +107,7 @@ impl World {
         self.run_for(Duration::from_secs(2));
         let heard = self.heard();
         let flows = self.stages().len();
-        assert_eq!(
-            heard,
-            Heard {
-                sent: 2 * 50 * flows,
-                lost: 0,
-                twice: 0,
-                late: 0
-            },
-            "{what}"
-        );
+        assert_eq!(heard, Heard { sent: 2 * 50 * flows, lost: 0, twice: 0, late: 0 }, "{what}");
     }
 }
 
@@ -147,20 +130,12 @@ fn of_twenty_flows_four_are_gateways_and_all_nodes_reach_the_robot_and_are_reach
             world.run_for(Duration::from_secs(8));
             let now = world.gateways();
             let stayed = first.iter().filter(|index| now.contains(index)).count();
-            assert!(
-                now.len() == 4 && !now.contains(&victim),
-                "seed {seed}: {:?}",
-                world.stages()
-            );
+            assert!(now.len() == 4 && !now.contains(&victim), "seed {seed}: {:?}", world.stages());
             assert!(stayed > 0 || first.len() < 4);
             world.round("after a gateway was killed");
             world.restart(victim);
             world.run_for(Duration::from_secs(12));
-            assert_eq!(
-                world.gateways(),
-                now,
-                "seed {seed}: who comes back finds enough gateways"
-            );
+            assert_eq!(world.gateways(), now, "seed {seed}: who comes back finds enough gateways");
             world.round("after it came back");
         }
     }
@@ -193,8 +168,8 @@ fn a_gateway_that_is_stopped_hands_over_what_it_carries_without_loss_or_repeat()
     }
 }
 
-/// While services on all nodes publish, most flows leave the inter scope, as the layer has become large, and come back when it
-/// is small again for a minute.
+/// While services on all nodes publish, most flows leave the inter scope, as the layer has become
+/// large, and come back when it is small again for a minute.
 #[test]
 fn who_becomes_a_member_or_a_gateway_misses_nothing_meanwhile() {
     for seed in 0..2 {
@@ -207,7 +182,8 @@ fn who_becomes_a_member_or_a_gateway_misses_nothing_meanwhile() {
         for _ in 0..2 {
             world.add();
         }
-        // Those who have just come hear the robot only when they are ready: what was said before is not for them.
+        // Those who have just come hear the robot only when they are ready: what was said before is
+        // not for them.
         world.of_nodes = false;
         world.run_for(Duration::from_secs(5));
         world.said.clear();
@@ -228,11 +204,8 @@ fn who_becomes_a_member_or_a_gateway_misses_nothing_meanwhile() {
             (0, 0, 0),
             "seed {seed}, leaving: {heard:?}"
         );
-        let members: BTreeSet<usize> = world
-            .stages()
-            .into_keys()
-            .filter(|index| !world.gateways().contains(index))
-            .collect();
+        let members: BTreeSet<usize> =
+            world.stages().into_keys().filter(|index| !world.gateways().contains(index)).collect();
         for index in members.into_iter().take(3) {
             world.end(index, End::Stopped);
             world.run_for(Duration::from_secs(1));
@@ -274,7 +247,8 @@ fn control_traffic_grows_with_the_flows_alone() {
         let end = said(&world);
         let (messages, bytes) = ((end.0 - start.0) / 10, (end.1 - start.1) / 10);
         println!(
-            "{clouds} flows: {} messages and {} bytes on the channel until all are known, then {messages} messages and {bytes} \
+            "{clouds} flows: {} messages and {} bytes on the channel until all are known, then \
+             {messages} messages and {bytes} \
              bytes a second; {} flows on the inter scope",
             start.0,
             start.1,

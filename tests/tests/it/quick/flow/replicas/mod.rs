@@ -1,8 +1,9 @@
-//! Two cloud flows on one simulated Kafka and a robot on a simulated Redis, joined by a simulated network: the code of
-//! production, while replicas are stopped, killed and started again.
+//! Two cloud flows on one simulated Kafka and a robot on a simulated Redis, joined by a simulated
+//! network: the code of production, while replicas are stopped, killed and started again.
 //!
-//! Reliable topics lose nothing when a replica is stopped, and what lies on Kafka is not lost when one is killed; no message
-//! reaches a consumer twice under one identity, but for a consumer on Kafka that drops repeats.
+//! Reliable topics lose nothing when a replica is stopped, and what lies on Kafka is not lost when
+//! one is killed; no message reaches a consumer twice under one identity, but for a consumer on
+//! Kafka that drops repeats.
 
 mod balance;
 mod frozen;
@@ -36,10 +37,7 @@ fn run(end: End) -> (u64, u64) {
         world.stop_publishing();
         world.run_for(Duration::from_secs(4));
         let found = world.judge();
-        assert!(
-            found.sent_down > 2_000 && found.sent_up > 2_000,
-            "seed {seed}: {found:?}"
-        );
+        assert!(found.sent_down > 2_000 && found.sent_up > 2_000, "seed {seed}: {found:?}");
         assert_eq!(
             found.lost_down, 0,
             "seed {seed}, {end:?}: what lies on Kafka is not lost: {found:?}"
@@ -71,7 +69,8 @@ fn a_replica_that_is_killed_is_replaced_and_what_lies_on_kafka_arrives_once() {
     assert!(repeats > 0, "no takeover ever began in the past");
 }
 
-/// While the two do not hear each other on Kafka both carry the topic; the robot gets each message once all the same.
+/// While the two do not hear each other on Kafka both carry the topic; the robot gets each message
+/// once all the same.
 #[test]
 fn replicas_that_do_not_hear_each_other_do_no_harm() {
     for seed in seeds() {

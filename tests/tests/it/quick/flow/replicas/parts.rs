@@ -55,7 +55,8 @@ pub(crate) struct Record {
 /// Channels that keep what is written.
 pub(crate) type Log = Arc<Mutex<BTreeMap<String, Vec<Record>>>>;
 
-/// A server that keeps a log, and stands still at times: then what is written waits with whoever writes it.
+/// A server that keeps a log, and stands still at times: then what is written waits with whoever
+/// writes it.
 #[derive(Clone, Default)]
 pub(crate) struct Server {
     pub(crate) log: Log,
@@ -71,7 +72,12 @@ struct Standing {
 }
 
 impl Server {
-    pub(crate) fn writer(&self, flow: usize, channel: String, clock: &Arc<Mutex<Instant>>) -> LogWriter {
+    pub(crate) fn writer(
+        &self,
+        flow: usize,
+        channel: String,
+        clock: &Arc<Mutex<Instant>>,
+    ) -> LogWriter {
         let mut state = self.state.lock();
         state.writers += 1;
         LogWriter {
@@ -97,7 +103,9 @@ impl Server {
                 break;
             };
             match state.waiting.get_mut(&key).and_then(VecDeque::pop_front) {
-                Some((channel, record)) => log.entry(channel).or_default().push(Record { at: now, ..record }),
+                Some((channel, record)) => {
+                    log.entry(channel).or_default().push(Record { at: now, ..record })
+                }
                 None => drop(state.waiting.remove(&key)),
             }
         }
@@ -141,10 +149,7 @@ impl Publisher for LogWriter {
     }
     fn later(&self) -> Later {
         let queued = self.server.state.lock().waiting.get(&self.key).map_or(0, VecDeque::len);
-        Later {
-            queued: queued as u64,
-            ..Later::default()
-        }
+        Later { queued: queued as u64, ..Later::default() }
     }
 }
 

@@ -27,18 +27,13 @@ impl World {
             if deaf && scope == Scope::Layer {
                 continue;
             }
-            let server = if scope == Scope::Layer {
-                &self.kafka
-            } else {
-                &self.redis
-            };
+            let server = if scope == Scope::Layer { &self.kafka } else { &self.redis };
             let visible = server.readable(now) - self.kafka_delay;
             let log = Arc::clone(&server.log);
             let flow = &mut self.flows[index];
-            let (Some(next), Some(id)) = (
-                flow.reads.get_mut(&(topic.clone(), scope)),
-                flow.plane.core.find(topic.as_str()),
-            ) else {
+            let (Some(next), Some(id)) =
+                (flow.reads.get_mut(&(topic.clone(), scope)), flow.plane.core.find(topic.as_str()))
+            else {
                 continue;
             };
             let log = log.lock();
@@ -120,13 +115,7 @@ impl World {
 
     fn carry_out(&mut self, index: usize, output: Output) {
         let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
-        if let Output::Plan {
-            topic,
-            plan,
-            info,
-            duty,
-        } = output
-        {
+        if let Output::Plan { topic, plan, info, duty } = output {
             let places = self.apply(index, &topic, &plan, *info, &duty);
             if duty == Duty::GivesUp {
                 self.flows[index].control.given_up(now, wall_ms, &topic, places);
@@ -137,22 +126,9 @@ impl World {
             if self.flows[index].mute {
                 return;
             }
-            let content = Content::Bare {
-                payload: body,
-                identity: None,
-            };
-            let record = Record {
-                content,
-                at: now,
-                by: index,
-            };
-            return self
-                .kafka
-                .log
-                .lock()
-                .entry("peers".to_owned())
-                .or_default()
-                .push(record);
+            let content = Content::Bare { payload: body, identity: None };
+            let record = Record { content, at: now, by: index };
+            return self.kafka.log.lock().entry("peers".to_owned()).or_default().push(record);
         }
         let flow = &mut self.flows[index];
         let Some(engine) = &mut flow.plane.engine else {
@@ -205,10 +181,7 @@ impl World {
                 _ => (redis, Scope::Node),
             };
             let writer = server.writer(index, channel(index, scope, topic.as_str()), clock);
-            Ok(NewWriter {
-                publisher: Arc::new(writer),
-                options: PublisherOptions::default(),
-            })
+            Ok(NewWriter { publisher: Arc::new(writer), options: PublisherOptions::default() })
         });
         if let Duty::Takes(begin) = duty {
             flow.plane.core.takes_over(id, begin);
@@ -226,7 +199,8 @@ impl World {
             let log = if scope == Scope::Layer { kafka } else { redis }.log.lock();
             let records = log.get(&channel(index, scope, topic.as_str()));
             let records = records.map_or(&[][..], Vec::as_slice);
-            let anew = matches!(duty, Duty::Takes(begin) if scope == Scope::Layer && *begin != Begin::Now);
+            let anew =
+                matches!(duty, Duty::Takes(begin) if scope == Scope::Layer && *begin != Begin::Now);
             let again = flow.reads.contains_key(&key);
             if again && !anew {
                 continue;
@@ -240,10 +214,8 @@ impl World {
                 Begin::At(offsets) => offsets[0] as usize,
                 Begin::Since { appended_ms, latest } => {
                     let at = self.start + Duration::from_millis(appended_ms.max(0) as u64);
-                    let first = records
-                        .iter()
-                        .position(|record| record.at >= at)
-                        .unwrap_or(records.len());
+                    let first =
+                        records.iter().position(|record| record.at >= at).unwrap_or(records.len());
                     latest.first().map_or(first, |latest| first.min(*latest as usize))
                 }
             };
@@ -259,9 +231,7 @@ impl World {
     pub(crate) fn leave(&mut self, index: usize) {
         let now = self.now;
         let flow = &mut self.flows[index];
-        if flow
-            .leaves
-            .is_some_and(|since| now - since >= Duration::from_millis(100))
+        if flow.leaves.is_some_and(|since| now - since >= Duration::from_millis(100))
             && let Some(engine) = &mut flow.plane.engine
         {
             (flow.inside, flow.leaves) = (false, None);
@@ -272,8 +242,11 @@ impl World {
         match flow.life {
             Life::Draining(since) => {
                 let over = now - since >= Duration::from_millis(600);
-                let written = now - since >= Duration::from_millis(2_100) || !flow.plane.core.has_unwritten();
-                if written && (over || (flow.control.has_handed_over() && !flow.plane.core.is_draining())) {
+                let written =
+                    now - since >= Duration::from_millis(2_100) || !flow.plane.core.has_unwritten();
+                if written
+                    && (over || (flow.control.has_handed_over() && !flow.plane.core.is_draining()))
+                {
                     flow.control.say_goodbye();
                     if let Some(engine) = &mut flow.plane.engine {
                         engine.goodbye();
@@ -291,22 +264,16 @@ impl World {
 
     pub(crate) fn transmit(&mut self, index: usize) {
         let now = self.now;
-        while let Some(transmit) = self.flows[index]
-            .plane
-            .engine
-            .as_mut()
-            .and_then(|engine| engine.poll_transmit(now))
+        while let Some(transmit) =
+            self.flows[index].plane.engine.as_mut().and_then(|engine| engine.poll_transmit(now))
         {
             let between = index > 0 && transmit.to.flow.layer.as_str() == "cloud";
             if self.split && between {
                 continue;
             }
             let jitter = Duration::from_micros(self.random.random_range(0..2_000));
-            let packet = Packet {
-                to: transmit.to,
-                class: transmit.class,
-                datagram: transmit.datagram,
-            };
+            let packet =
+                Packet { to: transmit.to, class: transmit.class, datagram: transmit.datagram };
             self.network.send(now + self.one_way + jitter, packet);
         }
         let flow = &mut self.flows[index];

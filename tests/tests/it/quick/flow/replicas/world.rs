@@ -151,11 +151,7 @@ impl World {
 
     fn make_flow(&self, index: usize, epoch: u64) -> Flow {
         let robot = index == 0;
-        let name = if robot {
-            "edge/robot-1".to_owned()
-        } else {
-            format!("cloud/cloud-{index}")
-        };
+        let name = if robot { "edge/robot-1".to_owned() } else { format!("cloud/cloud-{index}") };
         let id: FlowId = name.parse().unwrap();
         let kind = if robot { LayerKind::Edge } else { LayerKind::Cloud };
         let layer_scope = (!robot).then(|| LayerScopeId::kafka(""));
@@ -194,10 +190,7 @@ impl World {
         control.hears_replicas(self.now);
         Flow {
             control,
-            plane: PlaneState {
-                core,
-                engine: Some(Engine::new(engine, self.now, self.wall())),
-            },
+            plane: PlaneState { core, engine: Some(Engine::new(engine, self.now, self.wall())) },
             id,
             epoch,
             life: Life::Alive,
@@ -215,7 +208,8 @@ impl World {
     /// The services of a flow's broker send their leases; on Kafka each replica hears them.
     fn lease(&mut self, index: usize) {
         let message = |op: &str, topic: &str| {
-            json!({"op": op, "topic": topic, "service": "s", "ttl_s": 0, "reliability": "reliable"}).to_string()
+            json!({"op": op, "topic": topic, "service": "s", "ttl_s": 0, "reliability": "reliable"})
+                .to_string()
         };
         let (scope, messages) = if index == 0 {
             (Scope::Node, [message("advertise", UP), message("request", DOWN)])
@@ -273,12 +267,8 @@ impl World {
 
     pub(crate) fn restart(&mut self, index: usize) {
         assert_eq!(self.flows[index].life, Life::Dead, "it has not ended in time");
-        let heard = self
-            .redis
-            .log
-            .lock()
-            .get(&channel(index, Scope::Node, DOWN))
-            .map_or(0, Vec::len);
+        let heard =
+            self.redis.log.lock().get(&channel(index, Scope::Node, DOWN)).map_or(0, Vec::len);
         self.lives.entry(index).or_default().push(heard);
         self.flows[index] = self.make_flow(index, self.flows[index].epoch + 1);
         self.lease(index);
@@ -301,7 +291,8 @@ impl World {
     /// The replica that carries what the robot asks for.
     pub(crate) fn carrier_down(&self) -> Option<usize> {
         let topic: TopicName = DOWN.parse().unwrap();
-        let carries = |flow: &Flow| flow.control.plans().get(&topic).is_some_and(TopicPlan::carries_out);
+        let carries =
+            |flow: &Flow| flow.control.plans().get(&topic).is_some_and(TopicPlan::carries_out);
         self.flows.iter().position(carries)
     }
 
@@ -331,13 +322,12 @@ impl World {
         self.discover();
         while let Some(packet) = self.network.arrived(self.now) {
             let reads = |flow: &&mut Flow| {
-                flow.life != Life::Dead && flow.id == packet.to.flow && flow.epoch == packet.to.epoch
+                flow.life != Life::Dead
+                    && flow.id == packet.to.flow
+                    && flow.epoch == packet.to.epoch
             };
-            if let Some(engine) = self
-                .flows
-                .iter_mut()
-                .find(reads)
-                .and_then(|flow| flow.plane.engine.as_mut())
+            if let Some(engine) =
+                self.flows.iter_mut().find(reads).and_then(|flow| flow.plane.engine.as_mut())
             {
                 engine.receive(self.now, packet.datagram, packet.class);
             }
@@ -356,9 +346,8 @@ impl World {
     pub(crate) fn publish_on_nodes(&mut self) {
         self.round += 1;
         let sequence = self.round;
-        let alive: Vec<usize> = (0..=self.clouds)
-            .filter(|index| self.flows[*index].life == Life::Alive)
-            .collect();
+        let alive: Vec<usize> =
+            (0..=self.clouds).filter(|index| self.flows[*index].life == Life::Alive).collect();
         for index in alive {
             let (topic, id) = (if index == 0 { TELEOP } else { STATUS }, &self.flows[index].id);
             let origin = Origin {
@@ -372,7 +361,9 @@ impl World {
                 ..Header::new(topic, origin, node_writer(index), sequence, self.wall())
             };
             let record = Record {
-                content: Content::Frame(Frame::new(&header, Bytes::from_static(b"payload")).unwrap()),
+                content: Content::Frame(
+                    Frame::new(&header, Bytes::from_static(b"payload")).unwrap(),
+                ),
                 at: self.now,
                 by: usize::MAX,
             };
@@ -408,10 +399,18 @@ impl World {
             };
             let header = Header {
                 reliable: true,
-                ..Header::new(topic, origin, WriterId([topic.len() as u8; 16]), self.sent, self.wall())
+                ..Header::new(
+                    topic,
+                    origin,
+                    WriterId([topic.len() as u8; 16]),
+                    self.sent,
+                    self.wall(),
+                )
             };
             let record = Record {
-                content: Content::Frame(Frame::new(&header, Bytes::from_static(b"payload")).unwrap()),
+                content: Content::Frame(
+                    Frame::new(&header, Bytes::from_static(b"payload")).unwrap(),
+                ),
                 at: self.now,
                 by: usize::MAX,
             };
@@ -427,12 +426,10 @@ impl World {
                     && [a, b]
                         .iter()
                         .all(|at| self.flows[*at].life == Life::Alive && self.flows[*at].inside);
-                if both && self.known.get(&(a, b)) != Some(&lives) && self.random.random_bool(0.05) {
+                if both && self.known.get(&(a, b)) != Some(&lives) && self.random.random_bool(0.05)
+                {
                     self.known.insert((a, b), lives);
-                    let endpoint = Endpoint {
-                        flow: self.flows[b].id.clone(),
-                        epoch: lives.1,
-                    };
+                    let endpoint = Endpoint { flow: self.flows[b].id.clone(), epoch: lives.1 };
                     let now = self.now;
                     if let Some(engine) = &mut self.flows[a].plane.engine {
                         engine.peer_discovered(now, endpoint);
@@ -470,23 +467,20 @@ impl World {
         late
     }
 
-    /// Messages that services of the replicas' nodes missed or got out of turn within a life of their flow.
+    /// Messages that services of the replicas' nodes missed or got out of turn within a life of
+    /// their flow.
     fn holes(&self) -> usize {
         let log = self.redis.log.lock();
         let mut holes = 0;
         for index in 1..=self.clouds {
-            let all = log
-                .get(&channel(index, Scope::Node, DOWN))
-                .map_or(&[][..], Vec::as_slice);
+            let all = log.get(&channel(index, Scope::Node, DOWN)).map_or(&[][..], Vec::as_slice);
             let begins = self.lives.get(&index).map_or(&[][..], Vec::as_slice);
             let sequence = |record: &Record| match &record.content {
                 Content::Frame(frame) => frame.sequence(),
                 _ => 0,
             };
             let pairs = all.windows(2).enumerate().filter(|(at, _)| !begins.contains(&(at + 1)));
-            holes += pairs
-                .filter(|(_, pair)| sequence(&pair[1]) != sequence(&pair[0]) + 1)
-                .count();
+            holes += pairs.filter(|(_, pair)| sequence(&pair[1]) != sequence(&pair[0]) + 1).count();
         }
         holes
     }
@@ -494,10 +488,14 @@ impl World {
     pub(crate) fn judge(&mut self) -> Found {
         let up = Self::written(&self.kafka.log, UP);
         let down = Self::written(&self.redis.log, &channel(0, Scope::Node, DOWN));
-        let lost = |counts: &BTreeMap<u64, usize>| (1..=self.sent).filter(|n| !counts.contains_key(n)).count();
-        let twice = |counts: &BTreeMap<u64, usize>| counts.values().filter(|count| **count > 1).count();
+        let lost = |counts: &BTreeMap<u64, usize>| {
+            (1..=self.sent).filter(|n| !counts.contains_key(n)).count()
+        };
+        let twice =
+            |counts: &BTreeMap<u64, usize>| counts.values().filter(|count| **count > 1).count();
         let topic: TopicName = DOWN.parse().unwrap();
-        let carries = |flow: &&Flow| flow.control.plans().get(&topic).is_some_and(TopicPlan::carries_out);
+        let carries =
+            |flow: &&Flow| flow.control.plans().get(&topic).is_some_and(TopicPlan::carries_out);
         let core = &self.flows[0].plane.core;
         let dropped = core.find(DOWN).map_or(0, |id| core.path(id).ingress_drops.total());
         Found {
