@@ -99,14 +99,14 @@ def system_packages(*packages: str) -> None:
     run("apt-get", "-qq", "install", "-y", "--no-install-recommends", *packages, env=environment)
 
 
-def cargo_tool(name: str) -> None:
-    [pin] = pins(name)
-    target = HOME / "cargo" / f"target-{name}"
-    environment = {**os.environ, "CARGO_TARGET_DIR": str(target)}
+def cargo_tools() -> None:
+    """Compiled here, so without what takes time and nobody uses: debug information, updates of themselves, probes."""
+    target = HOME / "cargo" / "target"
+    environment = {**os.environ, "CARGO_TARGET_DIR": str(target), "CARGO_PROFILE_DEV_DEBUG": "0"}
     environment.pop("RUSTC_WORKSPACE_WRAPPER", None)  # lints are for our own code
-    root = HOME / "cargo"
-    run("cargo", "install", "--quiet", "--locked", "--debug", "--root", root, pin.package, "--version", pin.version,
-        "--force", env=environment)
+    for pin in pins("cargo"):
+        run("cargo", "install", "--quiet", "--locked", "--debug", "--no-default-features", "--root", HOME / "cargo",
+            pin.package, "--version", pin.version, "--force", env=environment)
     shutil.rmtree(target, ignore_errors=True)
 
 
@@ -349,8 +349,7 @@ def extract(wheel: Path, programs: dict[str, Path]) -> None:
 
 COMPONENTS = {
     "network": Component(network_tools, tools=("ip", "nft")),
-    "deny": Component(lambda: cargo_tool("deny"), files=(HOME / "cargo" / "bin" / "cargo-deny",)),
-    "nextest": Component(lambda: cargo_tool("nextest"), files=(HOME / "cargo" / "bin" / "cargo-nextest",)),
+    "cargo": Component(cargo_tools, files=tuple(HOME / "cargo" / "bin" / name for name in ("cargo-deny", "cargo-nextest"))),
     "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
     "valkey": Component(valkey, files=(BIN / "valkey-server",)),
     "etcd": Component(etcd, files=(BIN / "etcd",)),
