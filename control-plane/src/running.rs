@@ -180,7 +180,7 @@ async fn open_store(
         match waiting.news(&error.to_string(), Instant::now()) {
             News::Other(hint) => tracing::warn!(%error, hint, "waiting for the store"),
             News::Still => {
-                tracing::warn!("still waiting for the store, for the reason that was told before")
+                tracing::warn!("still waiting for the store, for the reason that was told before");
             }
             News::None => tracing::debug!(%error, "waiting for the store"),
         }

@@ -33,7 +33,7 @@ pub(super) fn log(level: RDKafkaLogLevel, facility: &str, line: &str) {
             tracing::warn!(target: "librdkafka", facility, "{line}");
         }
         RDKafkaLogLevel::Error | RDKafkaLogLevel::Warning => {
-            tracing::debug!(target: "librdkafka", facility, "{line}")
+            tracing::debug!(target: "librdkafka", facility, "{line}");
         }
         RDKafkaLogLevel::Notice | RDKafkaLogLevel::Info | RDKafkaLogLevel::Debug => {
             tracing::trace!(target: "librdkafka", facility, "{line}");

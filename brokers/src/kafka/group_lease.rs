@@ -218,7 +218,7 @@ impl Member {
             match question {
                 // Whoever asked has given up waiting, and asks again.
                 Ok(Question::Hold { answer, .. }) if answer.is_closed() => {
-                    self.asked = Some(Instant::now())
+                    self.asked = Some(Instant::now());
                 }
                 Ok(Question::Hold { note, answer }) => {
                     let held = self.hold(note);

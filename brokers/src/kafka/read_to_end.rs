@@ -91,7 +91,7 @@ impl<T> ReaderToEnd<T> {
                 }
                 // The client tries again by itself; what lasts ends at the deadline.
                 Some(Err(error)) => {
-                    tracing::debug!(topic = self.topic, %error, "reading to the end")
+                    tracing::debug!(topic = self.topic, %error, "reading to the end");
                 }
             }
         }

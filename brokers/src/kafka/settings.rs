@@ -345,7 +345,7 @@ pub(super) mod tests {
         {
             match refused(&format!(r#"{{"{key}": "x"}}"#)) {
                 OpenError::Setting { key: found, .. } => {
-                    assert_eq!(found, format!("kafka.properties.{key}"))
+                    assert_eq!(found, format!("kafka.properties.{key}"));
                 }
                 other => panic!("{other}"),
             }

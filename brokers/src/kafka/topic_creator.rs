@@ -106,7 +106,7 @@ impl TopicCreator {
                         %error,
                         topics = missing.len(),
                         "topics could not be made, trying on",
-                    )
+                    );
                 }
             }
         }
@@ -143,7 +143,7 @@ impl TopicCreator {
                         topic = %name,
                         error,
                         "could not be made to keep the last values",
-                    )
+                    );
                 }
             }
         }

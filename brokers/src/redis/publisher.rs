@@ -102,7 +102,7 @@ impl Batch {
         let to = Arc::clone(&waiting.to);
         match &waiting.body {
             Body::Bare(payload) => {
-                self.add(publish_command(&to.channel, &[], payload), payload.len())
+                self.add(publish_command(&to.channel, &[], payload), payload.len());
             }
             Body::Frame(frame) => {
                 let frame = Waiting::<Target>::aged(frame, waiting.since, now);
@@ -157,7 +157,7 @@ impl Batch {
         for (index, receipt) in self.receipts {
             match answers.get(index) {
                 Some(redis::Value::ServerError(_)) | None => {
-                    receipt.settle(Fate::Dropped(DropReason::BrokerError))
+                    receipt.settle(Fate::Dropped(DropReason::BrokerError));
                 }
                 Some(_) => receipt.settle(Fate::Delivered),
             }

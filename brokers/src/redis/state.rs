@@ -325,7 +325,7 @@ impl State {
         match health {
             Health::Up if turned => tracing::info!(detail, "redis is up"),
             Health::Down | Health::InUse if turned => {
-                tracing::warn!(detail, "redis cannot be used")
+                tracing::warn!(detail, "redis cannot be used");
             }
             _ => tracing::debug!(?health, detail, "redis"),
         }

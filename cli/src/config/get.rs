@@ -141,7 +141,7 @@ pub(super) async fn run(options: &GetOptions, output: Output) -> Result<Exit, Cl
             match format {
                 Format::Table => show_listing(kind, &listing, output, options.is_filtered())?,
                 Format::Json | Format::Yaml => {
-                    show_value(&listing.into_json(), format, options.watch)?
+                    show_value(&listing.into_json(), format, options.watch)?;
                 }
             }
             revision

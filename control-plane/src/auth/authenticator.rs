@@ -90,7 +90,7 @@ impl Authenticator {
             match KeyFile::of(index, key) {
                 Ok(file) => files.push(file),
                 Err(reason) => {
-                    faults.push(format!("control_plane.auth.keys[{index}].alg: {reason}"))
+                    faults.push(format!("control_plane.auth.keys[{index}].alg: {reason}"));
                 }
             }
         }

@@ -119,7 +119,7 @@ impl ControlTask {
         for received in batch.drain(..) {
             match received.content {
                 Content::Bare { payload, .. } => {
-                    control.control(Instant::now(), wall_ms(), scope, &payload)
+                    control.control(Instant::now(), wall_ms(), scope, &payload);
                 }
                 // Control channels carry JSON as it is.
                 Content::Frame(_) | Content::Malformed { .. } => control.refused += 1,
@@ -377,7 +377,7 @@ impl ControlChannel {
                 std::future::pending::<()>().await;
             }
             Err(error) => {
-                tracing::debug!(%error, "cannot subscribe to the control channel, trying on")
+                tracing::debug!(%error, "cannot subscribe to the control channel, trying on");
             }
         }
     }

@@ -238,7 +238,7 @@ impl InterScope {
         };
         match event {
             LinkEvent::PeerUp(endpoint) | LinkEvent::PeerAdmitted(endpoint) => {
-                transport.connect(endpoint)
+                transport.connect(endpoint);
             }
             LinkEvent::PeerRefused { flow, peers } => {
                 tracing::warn!(
@@ -248,7 +248,7 @@ impl InterScope {
                 );
             }
             LinkEvent::PeerDown { endpoint, reason: DownReason::Silent } => {
-                transport.disconnect(endpoint, &[Priority::State, Priority::Bulk])
+                transport.disconnect(endpoint, &[Priority::State, Priority::Bulk]);
             }
             LinkEvent::PeerDown { endpoint, .. }
             | LinkEvent::PeerForgotten(endpoint)

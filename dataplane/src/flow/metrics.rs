@@ -284,7 +284,7 @@ impl Page {
 
     fn fill_budgets(&self, now: Instant, shared: &Shared) {
         let budget = |to: &str, kind: &str, bytes: f64| {
-            self.add("blaze_flow_budget_bytes_per_second", &[to, kind], bytes)
+            self.add("blaze_flow_budget_bytes_per_second", &[to, kind], bytes);
         };
         let mut used = 0.0;
         for (layer, mut traffic) in shared.egress.traffic().by_layer {

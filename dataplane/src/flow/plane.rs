@@ -125,7 +125,7 @@ impl PlaneState {
             match event {
                 LinkEvent::Deliver { frame, .. } => self.core.deliver(now, frame, &mut self.engine),
                 LinkEvent::LaneSent { lane, bytes, wait } => {
-                    self.core.lane_sent(now, lane, bytes as u64, wait)
+                    self.core.lane_sent(now, lane, bytes as u64, wait);
                 }
                 LinkEvent::LaneOut { lane, bytes } => self.core.lane_out(lane, 1, bytes as u64),
                 LinkEvent::LaneCut { lane, begun } => self.core.lane_cut(lane, begun),

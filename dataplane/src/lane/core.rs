@@ -333,7 +333,7 @@ impl DataCore {
         for frame in frames {
             match self.find(frame.topic()) {
                 Some(topic) => {
-                    self.topics[topic.0 as usize].ingress_drops.add(DropReason::NoDestination, 1)
+                    self.topics[topic.0 as usize].ingress_drops.add(DropReason::NoDestination, 1);
                 }
                 None => self.unattributed.add(DropReason::NoDestination, 1),
             }

@@ -300,7 +300,7 @@ impl Capacity {
             Verdict::Slower | Verdict::Less => self.drain(drain.before, drain.carried, 1),
             // The link may have become slower meanwhile, by as much as was tried.
             Verdict::Stays if drain.trial < TRIALS => {
-                self.drain(drain.before, drain.carried, drain.trial + 1)
+                self.drain(drain.before, drain.carried, drain.trial + 1);
             }
             Verdict::Stays => {
                 self.delay.is_own(self.now, drain.least);

@@ -76,7 +76,7 @@ impl Engine {
         if datagram.header.link_sequence == 0 {
             datagram.for_each(|_, bytes| match LinkControl::decode(bytes) {
                 Ok(LinkControl { body: Some(body), .. }) => {
-                    self.control_received(now, &datagram.header, body)
+                    self.control_received(now, &datagram.header, body);
                 }
                 // A newer flow may say more than this one knows.
                 Ok(LinkControl { body: None, .. }) => {}
@@ -198,11 +198,11 @@ impl Engine {
                 self.ledger.events.push_back(LinkEvent::WrittenAsked { from, topic, token });
             }
             Body::Written(Written { token }) => {
-                self.ledger.events.push_back(LinkEvent::Written { from, token })
+                self.ledger.events.push_back(LinkEvent::Written { from, token });
             }
             Body::WrittenRequest(_) => {}
             Body::Goodbye(goodbye) if goodbye.epoch == peer.endpoint.epoch => {
-                self.goodbye_received(now, at)
+                self.goodbye_received(now, at);
             }
             Body::Goodbye(_) => self.counters.stale += 1,
             Body::Delta(_) | Body::SnapshotRequest(_) | Body::Snapshot(_) => {

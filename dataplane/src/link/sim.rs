@@ -385,7 +385,7 @@ impl Sim {
         while let Some(event) = node.engine.poll_event() {
             match event {
                 LinkEvent::Deliver { from, frame, at } => {
-                    node.delivered.push(Delivered { from, epoch, at, frame })
+                    node.delivered.push(Delivered { from, epoch, at, frame });
                 }
                 LinkEvent::LaneSent { lane, .. } => node.lanes.entry(lane).or_default().sent += 1,
                 LinkEvent::LaneOut { lane, .. } => node.lanes.entry(lane).or_default().out += 1,

@@ -48,7 +48,7 @@ impl Registry {
     pub fn set_role(&mut self, gateway: AutoBool, role: Role) -> BTreeSet<TopicName> {
         match self.own_view() {
             Some(own) if (own.gateway, own.role) != (gateway, role) => {
-                (own.gateway, own.role) = (gateway, role)
+                (own.gateway, own.role) = (gateway, role);
             }
             _ => return BTreeSet::new(),
         }

@@ -227,7 +227,7 @@ impl<'w> Explainer<'_, 'w> {
             };
             match found.iter_mut().find(|other| shared(other)) {
                 Some(other) if requester.flow == self.view.me && world.carries(requester.flow) => {
-                    *other = *requester
+                    *other = *requester;
                 }
                 Some(_) => {}
                 None => found.push(*requester),

@@ -160,7 +160,7 @@ fn leaves(value: &Value) -> Vec<String> {
 fn leaves_at(value: &Value, pointer: &str, out: &mut Vec<String>) {
     match plain_object(value).filter(|members| !members.is_empty()) {
         Some(members) => {
-            members.iter().for_each(|(name, member)| leaves_at(member, &push(pointer, name), out))
+            members.iter().for_each(|(name, member)| leaves_at(member, &push(pointer, name), out));
         }
         None => out.push(pointer.to_owned()),
     }

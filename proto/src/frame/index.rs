@@ -133,11 +133,11 @@ impl Index {
                 (5, Value::Fixed64(value)) => index.publish_time_ns = value,
                 (6, Value::Bytes(place)) => index.encoding = utf8(header, place, "encoding")?,
                 (7, Value::Varint(value)) => {
-                    index.compression = i32::try_from(value).unwrap_or(i32::MAX)
+                    index.compression = i32::try_from(value).unwrap_or(i32::MAX);
                 }
                 (8, Value::Varint(value)) => index.uncompressed_bytes = value,
                 (9, Value::Varint(value)) => {
-                    index.lifespan_ms = u32::try_from(value).unwrap_or(u32::MAX)
+                    index.lifespan_ms = u32::try_from(value).unwrap_or(u32::MAX);
                 }
                 (10, Value::Varint(value)) => index.priority = i32::try_from(value).unwrap_or(0),
                 (11, Value::Bytes(place)) => index.type_hash = utf8(header, place, "type_hash")?,
@@ -152,11 +152,11 @@ impl Index {
                     index.age_at = place_of(start, fields.at)?;
                 }
                 (14, Value::Bytes(place)) => {
-                    index.traceparent = utf8(header, place, "traceparent")?
+                    index.traceparent = utf8(header, place, "traceparent")?;
                 }
                 (15, Value::Varint(value)) => index.reliable = value != 0,
                 (16, Value::Varint(value)) => {
-                    index.depth = u32::try_from(value).unwrap_or(u32::MAX)
+                    index.depth = u32::try_from(value).unwrap_or(u32::MAX);
                 }
                 (1..=16, _) => {
                     return Err(FrameError::Header(format!("field {tag} has the wrong wire type")));

@@ -215,7 +215,7 @@ impl Hangup {
             tracing::warn!(
                 %error,
                 "SIGHUP will not reload the configuration",
-            )
+            );
         };
         Self(wanted.then(register).and_then(|signal| signal.inspect_err(failed).ok()))
     }
@@ -292,7 +292,7 @@ impl Directories {
                         %error,
                         path = %path.display(),
                         "directory is not watched, only polled",
-                    )
+                    );
                 }
             }
         }

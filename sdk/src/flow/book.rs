@@ -251,7 +251,7 @@ impl LeaseBook {
             match &mut record.state {
                 State::Held { next } => *next = Some(next.map_or(soon, |next| next.min(soon))),
                 State::Asking { next, .. } | State::Leaving { next, .. } => {
-                    *next = (*next).min(soon)
+                    *next = (*next).min(soon);
                 }
             }
         }

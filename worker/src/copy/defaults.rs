@@ -115,7 +115,7 @@ fn parse(text: &str, name: &str) -> Result<BTreeMap<Key, Document>, DefaultsErro
         let place = format!("{name} (document {number})");
         match document(value) {
             Err(found) => {
-                faults.extend(found.iter().map(|fault| format!("{place}: {}", told(fault))))
+                faults.extend(found.iter().map(|fault| format!("{place}: {}", told(fault))));
             }
             Ok(document) => {
                 let key = document.key.clone();

@@ -184,7 +184,7 @@ impl Run {
             let key: Key = KEYS[write.key].parse().unwrap();
             match &write.content {
                 Some(content) => {
-                    self.truth.put(Arc::new(written(KEYS[write.key], revision, content)))
+                    self.truth.put(Arc::new(written(KEYS[write.key], revision, content)));
                 }
                 None => {
                     self.truth.remove(&key);

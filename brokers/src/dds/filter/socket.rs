@@ -122,7 +122,7 @@ fn attach_one(socket: &Socket, samples: Samples, shape: &mut Shape) -> Result<()
         match socket.attach_filter(&filters(Shape::LARGE, samples)?) {
             Ok(()) => return Ok(()),
             Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => {
-                *shape = Shape::SMALL
+                *shape = Shape::SMALL;
             }
             Err(error) => return Err(system("the filter was refused")(error)),
         }

@@ -238,7 +238,7 @@ const AUDIT: &[Param] = &[
 /// One row; what is left out is as in most rows.
 macro_rules! row {
     ($verb:ident $path:expr, $operation:expr, $action:expr, $right:ident, $query:expr,
-        $payload:expr, $statuses:expr) => {
+        $payload:expr, $statuses:expr $(,)?) => {
         Route {
             verb: Verb::$verb,
             path: $path,

@@ -200,10 +200,10 @@ impl ConfigService {
         self.authorize(&caller.claims, Right::Write)?;
         match precondition {
             Precondition::Revisions(_) | Precondition::Any => {
-                self.check_view_of_existing(caller, &input.key).await?
+                self.check_view_of_existing(caller, &input.key).await?;
             }
             Precondition::None | Precondition::Absent => {
-                self.check_view(caller, &input.key).await?
+                self.check_view(caller, &input.key).await?;
             }
         }
         let bytes = input.spec.to_string().len();

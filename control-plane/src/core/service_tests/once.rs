@@ -31,7 +31,7 @@ async fn a_request_whose_caller_left_is_not_done_again() {
     loop {
         match create().await {
             Err(problem) if problem.code == Code::IdempotencyInProgress => {
-                tokio::task::yield_now().await
+                tokio::task::yield_now().await;
             }
             again => {
                 assert!(again.unwrap().replayed);

@@ -85,7 +85,7 @@ impl MongoStore {
                     tracing::debug!(
                         %error,
                         "no idle change stream: writes wait for whole milliseconds",
-                    )
+                    );
                 }
             }
         }

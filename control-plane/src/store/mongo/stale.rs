@@ -20,7 +20,7 @@ const IDLE_MICROS: i64 = 300_000;
 pub(super) async fn end_idle_transactions(tables: &Tables) {
     match end(tables).await {
         Ok(0) => {
-            tracing::debug!("another transaction holds the next revision, and is being worked on")
+            tracing::debug!("another transaction holds the next revision, and is being worked on");
         }
         Ok(count) => tracing::info!(count, "ended transactions of processes that are gone"),
         Err(error) => tracing::warn!(

@@ -66,7 +66,7 @@ where
     }
     match session.commit_transaction().await {
         Err(error) if error.contains_label(UNKNOWN_TRANSACTION_COMMIT_RESULT) => {
-            session.commit_transaction().await?
+            session.commit_transaction().await?;
         }
         result => result?,
     }

@@ -316,7 +316,7 @@ fn what_a_flow_carried_that_has_lost_its_way_out_begins_a_while_back() {
     let (now, ms) = (pair.now, pair.server_ms());
     match pair.flows[1].begin_carrying(now, &topic("t"), true) {
         Begin::Since { appended_ms, .. } => {
-            assert!((3500..4500).contains(&(ms - appended_ms)), "{ms} {appended_ms}")
+            assert!((3500..4500).contains(&(ms - appended_ms)), "{ms} {appended_ms}");
         }
         other => panic!("{other:?}"),
     }

@@ -253,7 +253,7 @@ pub fn references(document: &Document) -> Vec<(String, Key)> {
             refer("/spec/layer", document.spec_layer().and_then(layer));
         }
         Kind::Rollout => {
-            refer("/spec/target", document.spec_member("target").and_then(rollout_target))
+            refer("/spec/target", document.spec_member("target").and_then(rollout_target));
         }
     }
     out

@@ -116,7 +116,7 @@ impl Link {
     fn obey(&self, command: &Command) -> anyhow::Result<serde_json::Value> {
         match command {
             Command::Set(ways, changes) => {
-                self.lines(*ways).iter().for_each(|line| line.change(changes))
+                self.lines(*ways).iter().for_each(|line| line.change(changes));
             }
             Command::Cut(ways) => self.lines(*ways).iter().for_each(|line| line.cut()),
             Command::Heal(ways) => self.lines(*ways).iter().for_each(|line| line.heal()),

@@ -100,7 +100,7 @@ pub(crate) async fn subscribe(
                 return Reader { subscription, waiting: Vec::new() };
             }
             Err(BrokerError::Away(_)) if Instant::now() < until => {
-                tokio::time::sleep(Duration::from_millis(10)).await
+                tokio::time::sleep(Duration::from_millis(10)).await;
             }
             Err(error) => panic!("{channel}: {error}"),
         }

@@ -110,10 +110,10 @@ pub(crate) async fn check(store: &(impl CommitLog + ?Sized), ledger: &Ledger) {
     for (batch, told) in ledger {
         match told {
             Told::Yes => {
-                assert!(there.contains_key(batch.as_str()), "{batch} was acknowledged and is lost")
+                assert!(there.contains_key(batch.as_str()), "{batch} was acknowledged and is lost");
             }
             Told::No => {
-                assert!(!there.contains_key(batch.as_str()), "{batch} was refused and is there")
+                assert!(!there.contains_key(batch.as_str()), "{batch} was refused and is there");
             }
             Told::Unknown => {}
         }

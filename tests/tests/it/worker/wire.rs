@@ -181,7 +181,7 @@ async fn is_served(stage: &Stage, recorded: &[Recorded], protocol: u32) {
         let next = tokio::time::timeout(PATIENCE, stream.told.next()).await.unwrap();
         match told(&next.unwrap().unwrap()) {
             Told::Welcome(welcome) => {
-                assert_eq!((welcome.protocol, welcome.resumed), (protocol, false))
+                assert_eq!((welcome.protocol, welcome.resumed), (protocol, false));
             }
             Told::Snapshot(part) => documents += part.documents.len(),
             Told::Bookmark(bookmark) => {

@@ -31,7 +31,7 @@ async fn until(subscription: &mut Subscription, last: &str) -> Vec<String> {
         assert_eq!(received, Ok(1), "after {texts:?}");
         match &batch[0].content {
             Content::Bare { payload, .. } => {
-                texts.push(String::from_utf8(payload.to_vec()).unwrap())
+                texts.push(String::from_utf8(payload.to_vec()).unwrap());
             }
             other => panic!("{other:?}"),
         }

@@ -104,7 +104,7 @@ impl Server {
             };
             match state.waiting.get_mut(&key).and_then(VecDeque::pop_front) {
                 Some((channel, record)) => {
-                    log.entry(channel).or_default().push(Record { at: now, ..record })
+                    log.entry(channel).or_default().push(Record { at: now, ..record });
                 }
                 None => drop(state.waiting.remove(&key)),
             }
