@@ -8,7 +8,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::{DdsError, Participant, Profile};
+use super::farewell::Farewell;
+use super::{DdsError, GuidPrefix, Participant, Profile, create_error};
 
 /// What is to go wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,6 +18,8 @@ pub enum Fault {
     Panic,
     /// The event loop stands still for a minute.
     Hang,
+    /// A good-bye comes that another participant did not say.
+    GoodBye(GuidPrefix),
 }
 
 struct Trap(Fault);
@@ -27,11 +30,17 @@ impl Wake for Trap {
         match self.0 {
             Fault::Panic => panic!("injected into the event loop"),
             Fault::Hang => thread::sleep(Duration::from_secs(60)),
+            Fault::GoodBye(_) => {}
         }
     }
 }
 
 pub(super) fn inject(participant: &Participant, fault: Fault) -> Result<(), DdsError> {
+    if let Fault::GoodBye(whose) = fault {
+        let said = Farewell::new(participant.address(), participant.port())
+            .and_then(|mut farewell| farewell.say(whose));
+        return said.map_err(create_error("socket"));
+    }
     let topic = format!("blaze/fault/{}", participant.prefix());
     let profile = Profile::best_effort(1);
     let reader = participant.raw_reader(&topic, profile)?;

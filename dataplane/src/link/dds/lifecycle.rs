@@ -25,6 +25,8 @@ const LIVE: Duration = Duration::from_millis(1200);
 const GOOD_BYE: Duration = Duration::from_secs(1);
 const RETRY: Duration = Duration::from_secs(1);
 const COUNT: Duration = Duration::from_secs(1);
+/// Least time between two lives that end because of others.
+const LIFE: Duration = Duration::from_secs(10);
 
 pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
     thread::Builder::new()
@@ -35,7 +37,7 @@ pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
 
 /// One life of the participant. Fields drop in this order: users first, the participant last.
 struct Generation {
-    _watch: EndpointWatch,
+    watch: EndpointWatch,
     readers: Vec<Reader>,
     pulse: Pulse,
     participant: Participant,
@@ -87,8 +89,11 @@ impl Lifecycle {
 
     fn tick(&mut self) {
         let now = Instant::now();
+        let age = now.saturating_duration_since(self.built);
         if let Some(illness) = self.generation.as_mut().and_then(Generation::illness) {
             self.bury(&illness.to_string());
+        } else if age > LIFE && self.generation.as_ref().is_some_and(Generation::has_missed_one) {
+            self.bury("a participant came back after it was lost");
         }
         if self.generation.is_none() && now >= self.next_attempt {
             self.give_birth(now);
@@ -110,7 +115,7 @@ impl Lifecycle {
 
     /// Puts a dead participant aside.
     fn bury(&mut self, reason: &str) {
-        tracing::error!(flow = %self.local, reason, "DDS participant died, building a new one");
+        tracing::error!(flow = %self.local, reason, "DDS participant ended, building a new one");
         // What came since the last look is not counted.
         self.dropped_before = self.shared.status.lock().dropped_by_kernel;
         self.lay_aside();
@@ -261,7 +266,13 @@ impl Generation {
                 note_readers(&watcher, &own, &mut known.lock(), &endpoints.readers);
             }),
         )?;
-        Ok(Self { _watch: watch, readers, pulse, participant })
+        Ok(Self { watch, readers, pulse, participant })
+    }
+
+    /// Whether another one came back that RustDDS cannot meet again in this life: after silence for
+    /// longer than its lease (50 s), or after a good-bye that it did not say.
+    fn has_missed_one(&self) -> bool {
+        self.watch.has_returned()
     }
 
     /// Why it must be replaced, if so.

@@ -200,6 +200,28 @@ fn four_flows_of_one_host_all_meet() {
     }
 }
 
+#[test]
+fn a_flow_that_was_lost_and_lives_is_met_again() {
+    let domain = free_domain();
+    let robot = start(domain, "edge/robot-1", 1);
+    let fog = start(domain, "fog/fog-1", 1);
+    robot.wait_discovered(&fog.endpoint, DISCOVERY);
+    fog.wait_discovered(&robot.endpoint, DISCOVERY);
+    fog.reach(&robot, &robot.endpoint);
+    let prefix = *robot.transport.shared.heard.lock().keys().next().unwrap();
+    *robot.transport.shared.fault.lock() = Some(Fault::GoodBye(prefix));
+    wait_for("loss", Duration::from_secs(4), || {
+        let events = robot.events.lock();
+        let lost = |event: &TransportEvent| matches!(event, TransportEvent::Lost(lost) if *lost == fog.endpoint);
+        events.iter().any(lost).then_some(())
+    });
+    robot.events.lock().clear();
+    // A life lasts ten seconds at least, and so does RustDDS' pause between announcements.
+    robot.wait_discovered(&fog.endpoint, 3 * DISCOVERY);
+    robot.reach(&fog, &fog.endpoint);
+    fog.reach(&robot, &endpoint("edge/robot-1", 2));
+}
+
 fn survives(fault: Fault) {
     let domain = free_domain();
     let robot = start(domain, "edge/robot-1", 1);

@@ -3,6 +3,5 @@
 //! `real/garbage.rs`.
 
 mod node_file;
-mod random;
 mod shapes;
 mod udp;

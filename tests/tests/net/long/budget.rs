@@ -17,7 +17,7 @@ use blaze_tests::wan::{Change, Shape, Ways};
 use blaze_tests::{long, wait};
 use serde_json::Value;
 
-use crate::cuts::{DELIVERY, FLOWING, dropped, hold_cut, watch};
+use crate::cuts::{DELIVERY, DOWN, FLOWING, dropped, hold_cut, watch};
 use crate::layers::{CAMERA, IMU, ODOMETRY, flow, one_link, service, stream};
 use crate::support::{Reading, busiest};
 
@@ -567,7 +567,7 @@ fn small_topics_are_back_a_second_after_a_cut() -> anyhow::Result<()> {
     running.wait_flowing()?;
     std::thread::sleep(SETTLE);
     let since = running.now();
-    let arrived = hold_cut(&running, Ways::Both)?;
+    let arrived = hold_cut(&running, Ways::Both, DOWN)?;
     let topics: Vec<&'static str> = small().iter().map(|stream| stream.topic).collect();
     let healed = watch(&running, Ways::Both, &topics, &arrived)?;
     println!(
