@@ -3,7 +3,8 @@
 //!
 //! ```text
 //! hold(note) ─► thread ─► assigned? no: what was committed last ─► not held
-//!                 │            └─ yes: commit the note ─► the coordinator takes it: held, from before the commit
+//!                 │            └─ yes: commit the note with a new number, read it back
+//!                 │                      └─ the same number: held, from before the commit
 //!                 └─► polls on in between; leaves the group when nobody asks any more
 //! ```
 //!
@@ -13,6 +14,9 @@
 //! takes it from nobody. Where it is taken nevertheless, the client gives it back only when the
 //! lease that was told is over. The topic stays empty: the note is the metadata of the committed
 //! offset.
+//!
+//! The commit is not waited for but read back, since the client waits for a commit without limit
+//! while the group changes, and the group may wait for this thread.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
@@ -95,6 +99,7 @@ impl GroupLease {
             asked: None,
             is_held: false,
             note: None,
+            number: rand::random(),
         };
         supervisor
             .spawn_thread("kafka-lease", TaskPolicy::MayEnd, move || member.run(&asked))
@@ -208,6 +213,8 @@ struct Member {
     is_held: bool,
     /// The last note that is known.
     note: Option<String>,
+    /// Of the last commit. No other member has it.
+    number: u64,
 }
 
 impl Member {
@@ -348,16 +355,17 @@ impl Member {
         // A member that has just got the partition leaves what the one before has left.
         let note = match is_assigned && self.is_held {
             true => note,
-            false => committed(consumer, &self.topic, self.patience)?,
+            false => committed(consumer, &self.topic, self.patience)?.1,
         };
         self.note = note.or(self.note.take());
-        if is_assigned {
-            // The callback of a commit that does not wait is never called by this client. One that
-            // waits does so for `socket.timeout.ms`, and while the coordinator is away for the
-            // session timeout as well.
-            consumer.commit(&position(&self.topic, self.note.as_deref())?, CommitMode::Sync)?;
-        }
-        let is_held = is_assigned && is_own();
+        let is_held = is_assigned && {
+            self.number = self.number.wrapping_add(1);
+            let position = position(&self.topic, Some((self.number, self.note.as_deref())))?;
+            consumer.commit(&position, CommitMode::Async)?;
+            // The coordinator answers in the order of the requests.
+            let (number, _) = committed(consumer, &self.topic, self.patience)?;
+            number == Some(self.number) && is_own()
+        };
         if is_held {
             self.is_warned = false;
             *consumer.context().promised.lock() = Some(now + self.options.time);
@@ -382,29 +390,34 @@ fn is_refusal(error: &KafkaError) -> bool {
     error.rdkafka_error_code().is_some_and(|code| code as i32 > 0)
 }
 
-/// The partition with a note.
-fn position(topic: &str, note: Option<&str>) -> KafkaResult<TopicPartitionList> {
+/// The partition with the number of a commit and its note.
+fn position(topic: &str, commit: Option<(u64, Option<&str>)>) -> KafkaResult<TopicPartitionList> {
     let mut list = TopicPartitionList::new();
     list.add_partition_offset(topic, PARTITION, Offset::Offset(0))?;
-    if let (Some(note), Some(mut partition)) = (note, list.find_partition(topic, PARTITION)) {
-        partition.set_metadata(note);
+    if let (Some((number, note)), Some(mut partition)) =
+        (commit, list.find_partition(topic, PARTITION))
+    {
+        partition.set_metadata(format!("{number:016x} {}", note.unwrap_or_default()));
     }
     Ok(list)
 }
 
-/// The note that was committed last.
+/// The number and the note of the last commit.
 fn committed(
     consumer: &BaseConsumer<Context>,
     topic: &str,
     patience: Duration,
-) -> KafkaResult<Option<String>> {
+) -> KafkaResult<(Option<u64>, Option<String>)> {
     let found = consumer.committed_offsets(position(topic, None)?, patience)?;
     let Some(partition) = found.find_partition(topic, PARTITION) else {
-        return Ok(None);
+        return Ok((None, None));
     };
     partition.error()?;
-    let note = partition.metadata().to_owned();
-    Ok(Some(note).filter(|note| !note.is_empty()))
+    let Some((number, note)) = partition.metadata().split_once(' ') else {
+        return Ok((None, None));
+    };
+    let note = Some(note.to_owned()).filter(|note| !note.is_empty());
+    Ok((u64::from_str_radix(number, 16).ok(), note))
 }
 
 #[cfg(test)]

@@ -201,7 +201,7 @@ impl Settings {
                 ("allow.auto.create.topics", "false"),
                 ("auto.offset.reset", "latest"),
                 ("session.timeout.ms", &session_ms),
-                // A commit that waits holds up the thread of the lease.
+                // An answer that does not come holds up the thread of the lease.
                 ("socket.timeout.ms", "5000"),
                 ("max.poll.interval.ms", &(session * 30).as_millis().to_string()),
                 // Members hear of each other's end with their heartbeats.
