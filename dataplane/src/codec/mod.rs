@@ -1,4 +1,4 @@
-//! Compression of payloads for the inter scope (F8).
+//! Compression of payloads for the inter scope.
 //!
 //! ```text
 //!                 effort: at which level? ◄──────────── what it cost

@@ -1,4 +1,5 @@
-//! What the allocator of F9 is told of the lanes, and what its word means for them.
+//! What the allocator (`docs/design/bandwidth.md`) is told of the lanes, and what its rates mean for
+//! them.
 //!
 //! A lane is all of a topic that goes to one receiver: what is published on the node scope and what
 //! is published on the layer scope share it, its rate and its bucket.
