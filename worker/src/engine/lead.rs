@@ -59,8 +59,8 @@ impl Engine {
     /// The state that is shown, as far as it is one of a main service.
     pub(super) fn mark(&self) -> Option<Mark> {
         Some(Mark {
-            store_id: self.replica.store_id()?.to_owned(),
-            revision: self.replica.state().revision(),
+            store_id: self.view.store_id()?.to_owned(),
+            revision: self.view.state().revision(),
         })
     }
 
@@ -72,7 +72,7 @@ impl Engine {
             (None, _) => false,
             (Some(_), None) => true,
             (Some(noted), Some(shown)) => {
-                let is_newest = self.replica.is_in_sync() && self.led_at.elapsed() > TRUST_AFTER;
+                let is_newest = self.view.is_in_sync() && self.led_at.elapsed() > TRUST_AFTER;
                 noted.store_id == shown.store_id && !shown.covers(noted) && !is_newest
             }
         }

@@ -105,7 +105,7 @@ impl Engine {
 
     /// The same, of a state that is another one as a whole.
     pub(super) fn note_texts_of_all(&mut self) {
-        let lacked = std::mem::replace(&mut self.lacks_texts, lacks_texts(self.replica.state()));
+        let lacked = std::mem::replace(&mut self.lacks_texts, lacks_texts(self.view.state()));
         self.owes_texts |= self.identity.delivery == Delivery::Text && lacked && !self.lacks_texts;
     }
 
