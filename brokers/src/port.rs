@@ -205,7 +205,7 @@ impl Content {
     #[must_use]
     pub fn size(&self) -> usize {
         match self {
-            Self::Frame(frame) => frame.wire_len(),
+            Self::Frame(frame) => frame.received_len(),
             Self::Bare { payload, .. } => payload.len(),
             Self::Malformed { bytes, .. } => *bytes,
         }

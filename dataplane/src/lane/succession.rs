@@ -78,7 +78,7 @@ impl Waiting {
     }
 
     fn cost(&self) -> usize {
-        self.frame.wire_len() + OVERHEAD
+        self.frame.received_len() + OVERHEAD
     }
 }
 
@@ -324,7 +324,7 @@ impl BridgeState {
     fn has_room(&self, message: &Waiting, link: &dyn LaneLink) -> bool {
         match (&self.sink, &self.target) {
             (Sink::Lane { class, .. }, Target::Inter { receiver, .. }) => {
-                link.has_room(receiver, *class, message.frame.wire_len())
+                link.has_room(receiver, *class, message.frame.received_len())
             }
             _ => true,
         }
