@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use blaze_domain::config::effective::At;
+use blaze_domain::config::effective::ConfigTarget;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Kind, Timestamp};
 use blaze_domain::{DocumentName, NodeName, ServiceName};
@@ -72,7 +72,7 @@ fn standing(
         return Err(RequestError::new(ErrorCode::NotReady, detail));
     }
     let Some(service) = &request.service else {
-        return Ok(served.standing_at(At {
+        return Ok(served.standing_at(ConfigTarget {
             service: None,
             instance: None,
             layer: Some(served.site().layer.clone()),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 pub use blaze_domain::config::ConfigScope as Scope;
 use blaze_domain::config::diff::{self, diff};
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::{Document, json, secret};
 use blaze_domain::{DocumentName, LayerName};
 use serde_json::{Map, Value};
@@ -44,7 +44,7 @@ impl Config {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Standing {
     /// Whose it is.
-    pub at: At,
+    pub at: ConfigTarget,
     /// Where the store stood when it became what it is.
     pub revision: u64,
     /// Over it.
@@ -90,7 +90,7 @@ impl Notice {
     pub fn standing(&self) -> Option<Standing> {
         let (hash, config) = (self.hash.clone()?, self.config.clone()?);
         Some(Standing {
-            at: At {
+            at: ConfigTarget {
                 service: Some(self.place.service.clone()),
                 instance: self.place.instance.as_ref().map(DocumentName::from),
                 layer: Some(self.layer.clone()),

@@ -3,7 +3,7 @@
 use std::fmt;
 
 pub use blaze_domain::config::ConfigSource as Source;
-use blaze_domain::config::effective::At;
+use blaze_domain::config::effective::ConfigTarget;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, Kind};
 use blaze_domain::{DocumentName, InstanceName, LayerName, NodeName, ServiceName};
@@ -36,8 +36,8 @@ pub struct Place {
 impl Place {
     /// The same for [`Sources`](blaze_domain::config::effective::Sources).
     #[must_use]
-    pub fn at(&self, site: &Site) -> At {
-        At {
+    pub fn at(&self, site: &Site) -> ConfigTarget {
+        ConfigTarget {
             service: Some(self.service.clone()),
             instance: self.instance.as_ref().map(DocumentName::from),
             layer: Some(site.layer.clone()),

@@ -21,7 +21,7 @@ use std::collections::BTreeSet;
 use std::time::Instant;
 
 use blaze_domain::config::Key;
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::state::State;
 use blaze_domain::{InstanceName, ServiceName};
 use serde_json::{Map, Value};
@@ -380,13 +380,19 @@ impl Served {
     }
 
     /// The configuration of a layer, or of a node of it, without any service.
-    pub(super) fn standing_at(&self, at: At) -> Standing {
+    pub(super) fn standing_at(&self, at: ConfigTarget) -> Standing {
         let sources = self.shown.sources(&at);
         let hash = sources.hash();
         self.standing(at, self.floor, hash, sources)
     }
 
-    fn standing(&self, at: At, revision: u64, hash: String, sources: Sources) -> Standing {
+    fn standing(
+        &self,
+        at: ConfigTarget,
+        revision: u64,
+        hash: String,
+        sources: Sources,
+    ) -> Standing {
         Standing {
             at,
             revision,

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use blaze_domain::ServiceName;
 use blaze_domain::config::Key;
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::spec::PROGRAMS;
 use blaze_domain::config::state::State;
 
@@ -22,7 +22,7 @@ pub(super) struct World {
 }
 
 impl World {
-    pub(super) fn sources(&self, at: &At) -> Sources {
+    pub(super) fn sources(&self, at: &ConfigTarget) -> Sources {
         Sources::at_where(&self.state, at, |rollout| !self.failed.contains(&rollout.uid))
     }
 
