@@ -9,8 +9,8 @@ use blaze_domain::{DocumentName, NodeName, ServiceName};
 
 use super::messages::{ErrorCode, GetRequest, RequestError};
 use super::notice::Standing;
-use super::place::{Place, Source};
 use super::served::Served;
+use super::served_target::{ServedTarget, Source};
 
 /// Names that are compared with one that does not exist, at most.
 const MAX_COMPARED: usize = 1_000;
@@ -79,7 +79,7 @@ fn standing(
             node,
         }));
     };
-    let place = Place { service: service.clone(), instance: request.instance.clone(), node };
+    let place = ServedTarget { service: service.clone(), instance: request.instance.clone(), node };
     match served.ask(&place, now) {
         Some(standing) => Ok(standing),
         None => {

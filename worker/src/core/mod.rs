@@ -22,9 +22,9 @@ mod incoming;
 mod layer_view;
 pub mod messages;
 mod notice;
-mod place;
 mod reach;
 mod served;
+mod served_target;
 #[cfg(test)]
 pub(crate) mod testing;
 mod told;
@@ -38,6 +38,6 @@ pub use health::{Complaint, MAX_SIGNS, Row, Signs, Trouble};
 pub use incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, OLDEST_PROTOCOL, PROTOCOL, SyncFault};
 pub use layer_view::{Applied, LayerView, ResumePoint};
 pub use notice::{Config, Notice, Scope, Standing};
-pub use place::{Place, Site, Source};
 pub use served::{MAX_FAILED, Served, Trial};
+pub use served_target::{ServedTarget, Site, Source};
 pub use told::{Flushed, Told};

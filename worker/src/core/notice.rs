@@ -10,7 +10,7 @@ use blaze_domain::config::{Document, json, secret};
 use blaze_domain::{DocumentName, LayerName};
 use serde_json::{Map, Value};
 
-use super::place::{Place, Source};
+use super::served_target::{ServedTarget, Source};
 
 /// Leaves that a notice names, at most. Beyond, whole objects are named instead.
 const MAX_LEAVES: usize = 1_000;
@@ -61,7 +61,7 @@ pub struct Standing {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Notice {
     /// Whose it is.
-    pub place: Place,
+    pub place: ServedTarget,
     /// The layer in which it counts.
     pub layer: LayerName,
     /// Where the store stood when it changed; never goes down for a place, and may be the same for

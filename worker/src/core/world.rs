@@ -8,7 +8,7 @@ use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::spec::PROGRAMS;
 use blaze_domain::config::state::State;
 
-use super::place::{Place, Site};
+use super::served_target::{ServedTarget, Site};
 
 /// All that an effective configuration follows from. A clone shares everything.
 #[derive(Clone, Default)]
@@ -32,7 +32,7 @@ impl World {
     }
 
     /// The documents that count at a place; `None` if its service is not there.
-    pub(super) fn at(&self, site: &Site, place: &Place) -> Option<Sources> {
+    pub(super) fn at(&self, site: &Site, place: &ServedTarget) -> Option<Sources> {
         self.has_service(&place.service).then(|| self.sources(&place.at(site)))
     }
 }

@@ -14,7 +14,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::{Engine, SETTLE};
-use crate::core::{Place, Source};
+use crate::core::{ServedTarget, Source};
 use crate::lease::Mark;
 use crate::serve::Told;
 
@@ -122,7 +122,7 @@ impl Engine {
     }
 
     /// Notifies every place but those that hear of a change anyway.
-    pub(super) fn announce(&mut self, except: &BTreeSet<Place>) {
+    pub(super) fn announce(&mut self, except: &BTreeSet<ServedTarget>) {
         if !self.may_announce() || !self.served.is_ready() {
             return;
         }

@@ -36,7 +36,7 @@ use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Loaded, Notes, Position, Update, defaults, lacks_text};
-use crate::core::{Gate, LayerView, Place, Served, Signs, Source};
+use crate::core::{Gate, LayerView, Served, ServedTarget, Signs, Source};
 use crate::lease::Mark;
 use ends::Ends;
 
@@ -108,7 +108,7 @@ pub struct Engine {
     /// When it was said last.
     acked: Instant,
     /// Places whose key is kept.
-    keyed: BTreeMap<String, Place>,
+    keyed: BTreeMap<String, ServedTarget>,
     /// Keys of an earlier life were looked for.
     has_swept: bool,
     /// Places that are not notified any more.

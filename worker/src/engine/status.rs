@@ -5,7 +5,7 @@ use blaze_domain::{InstanceName, NodeName};
 use serde_json::{Value, json};
 
 use super::{Counts, Engine, now};
-use crate::core::{Freshness, Place, Row, Source, Told};
+use crate::core::{Freshness, Row, ServedTarget, Source, Told};
 
 /// What the admin port shows.
 #[derive(Debug, Clone, PartialEq)]
@@ -82,7 +82,7 @@ impl Engine {
             .told()
             .map(|(place, told)| service(place, Some(told), self.signs.of(place)));
         let of_sign = self.signs.rows().filter_map(|(key, row)| {
-            let place = Place {
+            let place = ServedTarget {
                 service: key.service.clone(),
                 instance: Some(key.instance.clone()),
                 node: Some(key.node.clone()),
@@ -94,7 +94,7 @@ impl Engine {
     }
 }
 
-fn service(place: &Place, told: Option<&Told>, row: Option<&Row>) -> Value {
+fn service(place: &ServedTarget, told: Option<&Told>, row: Option<&Row>) -> Value {
     json!({
         "service": place.service.as_str(),
         "instance": place.instance.as_ref().map(InstanceName::as_str),
