@@ -4,7 +4,7 @@
 //! ```text
 //! Current ─▶ good and new ─▶ the program ─▶ is anything left for a restart? ─┬─▶ `/readyz`, check `config`
 //!         └▶ faulty ─────────────────────────────────────────────────────────┼─▶ the log, each fault once
-//!                                                                            └─▶ whoever gave the overlay
+//!                                                                            └─▶ the source of the overlay
 //! ```
 
 use std::sync::Arc;

@@ -7,7 +7,7 @@
 //!                            open, for as long as the gate says ──▶ applied
 //!                              │ Complaint of a place that it changed, within the window
 //!                              ▼
-//!                   more than max_unhealthy ──▶ failed: undone here, whoever else is there or not
+//!                   more than max_unhealthy ──▶ failed: undone here, with or without the main service
 //! ```
 //!
 //! A window begins when the changed configuration was told here, by whomever; in a new life of the
