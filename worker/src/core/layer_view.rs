@@ -3,7 +3,8 @@
 //! ```text
 //! connect ─▶ Hello(resume_point) ─▶ Welcome ─┬─ resumed ──────────────────────▶ Commit, Bookmark, … ─▶ disconnected
 //!                                            └─ Snapshot … Snapshot(last) ────▶        │
-//!                                                                                      └─ a fault: Hello with revision 0: asks for a snapshot
+//!                                                                                      └─ a fault: Hello with revision 0:
+//!                                                                                         asks for a snapshot
 //! ```
 //!
 //! Whatever goes wrong, the documents stay as they were: those that have been served go on being

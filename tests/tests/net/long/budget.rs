@@ -1,6 +1,6 @@
 //! The budget of a link under two saturating cameras: small topics keep their rate, images get what
-//! the allocation gives them, and no second carries more than the limit. Each row is one combination
-//! of link, limit, sharing and compression.
+//! the allocation gives them, and no second carries more than the limit. Each row combines a link,
+//! a limit, sharing and compression.
 
 use std::io::Write as _;
 use std::sync::OnceLock;
