@@ -32,13 +32,14 @@ pub enum KeyError {
     Pem(String),
     /// PEM of something else.
     #[error(
-        "holds a PEM section {found:?}; {algorithm} needs PUBLIC KEY (SPKI) or PRIVATE KEY (PKCS#8)"
+        "holds a PEM section {found}; {algorithm} needs PUBLIC KEY (SPKI) or PRIVATE KEY (PKCS#8): \
+         convert with `openssl pkcs8 -topk8 -nocrypt`"
     )]
     Section {
         /// What the key should be for.
         algorithm: Algorithm,
-        /// What it is.
-        found: String,
+        /// The label of the section.
+        found: &'static str,
     },
     /// Another kind of key, a broken one, or one that is too small.
     #[error("holds no {}", wanted(.0))]
@@ -152,10 +153,7 @@ fn from_pem(algorithm: Algorithm, file: &[u8]) -> Result<Key, KeyError> {
     let is_private = match kind {
         SectionKind::PrivateKey => true,
         SectionKind::PublicKey => false,
-        other => {
-            let found = format!("{other:?}");
-            return Err(KeyError::Section { algorithm, found });
-        }
+        other => return Err(KeyError::Section { algorithm, found: label(other) }),
     };
     if !is_private {
         let verify = public_key(algorithm, &der)?;
@@ -166,7 +164,7 @@ fn from_pem(algorithm: Algorithm, file: &[u8]) -> Result<Key, KeyError> {
         Algorithm::Rs256 => {
             let pair = RsaKeyPair::from_pkcs8(&der).map_err(|_| unusable())?;
             let public = DecodingKey::from_rsa_der(pair.public_key().as_ref());
-            // It takes the inner structure out of PKCS#8 itself.
+            // `from_rsa_pem` unwraps PKCS#8 itself.
             (public, EncodingKey::from_rsa_pem(file).map_err(|_| unusable())?)
         }
         Algorithm::EdDsa => {
@@ -180,6 +178,18 @@ fn from_pem(algorithm: Algorithm, file: &[u8]) -> Result<Key, KeyError> {
         verify: VerifyKey::new(algorithm, verify),
         sign: Some(SignKey { algorithm, key: sign }),
     })
+}
+
+/// The label of a PEM section that is no key which can be used.
+fn label(kind: SectionKind) -> &'static str {
+    match kind {
+        SectionKind::RsaPrivateKey => "RSA PRIVATE KEY",
+        SectionKind::EcPrivateKey => "EC PRIVATE KEY",
+        SectionKind::Certificate => "CERTIFICATE",
+        SectionKind::Csr => "CERTIFICATE REQUEST",
+        SectionKind::Crl => "X509 CRL",
+        _ => "of another kind",
+    }
 }
 
 fn only_section(file: &[u8]) -> Result<(SectionKind, Zeroizing<Vec<u8>>), KeyError> {

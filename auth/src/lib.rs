@@ -1,5 +1,5 @@
 //! Tokens of the configuration service: JWTs that are signed, checked, and turned into rights.
-//! Plain functions over bytes; files, network and clocks belong to who calls.
+//! Plain functions over bytes; files, network and clocks belong to the caller.
 //!
 //! ```text
 //! key files, JWKS ─[read_key, read_jwks]─▶ KeySet ─┐

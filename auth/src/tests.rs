@@ -187,9 +187,12 @@ fn bad_key_files_are_refused() {
     for file in [SECRET, b"", &both[..], &rsa.1[..rsa.1.len() / 2]] {
         assert!(matches!(read_key(Algorithm::Rs256, file, false), Err(KeyError::Pem(_))));
     }
-    let certificate = pem("CERTIFICATE", b"not looked at");
-    let found = read_key(Algorithm::Rs256, certificate.as_bytes(), false).unwrap_err();
-    assert!(matches!(found, KeyError::Section { .. }), "{found}");
+    for label in ["CERTIFICATE", "RSA PRIVATE KEY"] {
+        let other = pem(label, b"not looked at");
+        let found = read_key(Algorithm::Rs256, other.as_bytes(), false).unwrap_err();
+        assert_eq!(found, KeyError::Section { algorithm: Algorithm::Rs256, found: label });
+        assert!(found.to_string().starts_with(&format!("holds a PEM section {label}; RS256 ")));
+    }
 }
 
 #[test]

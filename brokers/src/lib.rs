@@ -20,8 +20,8 @@ mod worker_side;
 
 pub use open::{OpenError, check_layer, open_layer, open_node};
 pub use port::{
-    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, Place,
-    PublishOutcome, Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription,
-    SubscriptionSender, subscription,
+    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, ConsumerOffset, Content, FlowSide,
+    Health, Later, PublishOutcome, Publisher, PublisherOptions, Received, Role, SubscribeOptions,
+    Subscription, SubscriptionSender, subscription,
 };
 pub use worker_side::{Held, KeyedMessage, WorkerSide, WriteError};

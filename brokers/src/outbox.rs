@@ -51,7 +51,7 @@ impl Body {
     fn size(&self) -> usize {
         OVERHEAD_BYTES
             + match self {
-                Self::Frame(frame) => frame.wire_len(),
+                Self::Frame(frame) => frame.received_len(),
                 Self::Bare(payload) => payload.len(),
             }
     }

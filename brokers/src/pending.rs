@@ -4,7 +4,8 @@
 use std::collections::{HashMap, VecDeque};
 use std::hash::Hash;
 
-/// Values that wait at most; those beyond are dropped and counted.
+/// Values that wait at most; beyond that `put` returns false, and the caller decides (Redis:
+/// rewrite all leases; Kafka: the value is lost).
 const MAX_PENDING: usize = 131_072;
 
 /// What waits, each key once and in order.
@@ -14,18 +15,17 @@ pub(crate) struct Pending<K, V> {
     order: VecDeque<K>,
     /// Values that the last call took are not settled.
     under_way: bool,
-    dropped: u64,
 }
 
 impl<K, V> Default for Pending<K, V> {
     fn default() -> Self {
-        Self { values: HashMap::new(), order: VecDeque::new(), under_way: false, dropped: 0 }
+        Self { values: HashMap::new(), order: VecDeque::new(), under_way: false }
     }
 }
 
 impl<K: Hash + Eq + Clone, V> Pending<K, V> {
-    /// Takes a value in; an older one of the key that still waits is forgotten. Returns false where
-    /// too many wait.
+    /// Takes a value in, in place of an older one of the key that still waits. Returns false, and
+    /// takes nothing, where too many wait.
     pub(crate) fn put(&mut self, key: K, value: V) -> bool {
         if let Some(before) = self.values.get_mut(&key) {
             *before = value;
@@ -33,10 +33,6 @@ impl<K: Hash + Eq + Clone, V> Pending<K, V> {
             self.order.push_back(key.clone());
             self.values.insert(key, value);
         } else {
-            self.dropped += 1;
-            if self.dropped.is_power_of_two() {
-                tracing::warn!(dropped = self.dropped, "too many leases wait for the broker");
-            }
             return false;
         }
         true
@@ -117,6 +113,6 @@ mod tests {
         for key in 0..MAX_PENDING + 3 {
             assert_eq!(pending.put(key, ()), key < MAX_PENDING);
         }
-        assert_eq!((pending.values.len(), pending.dropped), (MAX_PENDING, 3));
+        assert_eq!(pending.values.len(), MAX_PENDING);
     }
 }

@@ -205,7 +205,7 @@ impl Content {
     #[must_use]
     pub fn size(&self) -> usize {
         match self {
-            Self::Frame(frame) => frame.wire_len(),
+            Self::Frame(frame) => frame.received_len(),
             Self::Bare { payload, .. } => payload.len(),
             Self::Malformed { bytes, .. } => *bytes,
         }
@@ -224,7 +224,7 @@ pub struct Received {
     /// It was published before the subscription and kept for late joiners.
     pub kept: bool,
     /// Where it lies on the server, if that keeps messages in places (Kafka).
-    pub place: Option<Place>,
+    pub place: Option<ConsumerOffset>,
 }
 
 impl Received {
@@ -241,9 +241,9 @@ impl Received {
     }
 }
 
-/// Where a message lies on a server that keeps messages.
+/// Partition and offset of a message on a server that keeps messages (Kafka).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct ConsumerOffset {
     /// Number of the partition, from 0.
     pub partition: usize,
     /// Its offset there; the next message has a larger one.

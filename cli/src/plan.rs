@@ -1,5 +1,6 @@
-//! `blaze plan`: the rate that each topic would get at each destination, worked out as a running
-//! flow works it out.
+//! `blaze plan`: the rate that each topic would get at each destination. It uses the allocator of a
+//! running flow with the configured limits only: measured link capacity and wire overhead are not
+//! known here (`--wire-factor` gives the latter).
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -24,8 +25,8 @@ pub struct PlanOptions {
     /// Flows and their topics (YAML)
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
-    /// What the wire carries per byte of s·α, as `wire_factor` of /v1/allocation shows it; 1 leaves
-    /// it out
+    /// Measured wire bytes per calculated byte (`wire_factor` in /v1/allocation of a running flow);
+    /// 1: no correction
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = parse_factor)]
     pub wire_factor: f64,
 }
@@ -297,8 +298,7 @@ mod tests {
         }
     }
 
-    /// The three layers of the paper: 160 Mbit/s, a camera of 30 Hz with images of 0.7 MB after
-    /// compression, and an IMU.
+    /// 160 Mbit/s, a camera of 30 Hz with images of 0.7 MB after compression, and an IMU.
     #[test]
     fn the_example_of_the_documentation_comes_out_as_printed() {
         let planned = plan_of(

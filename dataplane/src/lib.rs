@@ -1,4 +1,4 @@
-//! BlazeFlow: connects whoever publishes a topic with whoever asks for it.
+//! BlazeFlow: connects the publishers of a topic with the services that request it.
 //!
 //! See `ARCHITECTURE.md` for the map.
 

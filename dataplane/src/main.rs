@@ -27,8 +27,8 @@ use clap::Parser;
 /// A shutdown takes at most this long.
 const SHUTDOWN: Duration = Duration::from_secs(5);
 
-/// BlazeFlow: connects whoever publishes a topic with whoever asks for it, on any broker, on any
-/// layer.
+/// BlazeFlow: connects the publishers of a topic with the services that request it, on any broker
+/// and any layer.
 #[derive(Parser)]
 #[command(name = "blaze-flow", version)]
 struct Arguments {

@@ -7,7 +7,7 @@
 //! [`Frame::parse`] looks at the header once, without an allocation: texts stay where they are and
 //! are found by their place. Hops and age change on the way; [`Frame::with_hops_and_age`] notes
 //! them beside the bytes, and only a writer that puts the frame on a broker encodes them
-//! ([`Frame::head_to_write`]). The payload is never copied here.
+//! ([`Frame::head_to_write`]). Only [`Frame::to_bytes`] copies the payload.
 
 mod compressed;
 mod header;
@@ -38,6 +38,8 @@ pub const MAX_FRAME_BYTES: usize = PREFIX_BYTES + MAX_HEADER_BYTES + MAX_PAYLOAD
 
 const HOPS_TAG: u32 = 12;
 const AGE_TAG: u32 = 13;
+/// Hops and age need at most 17 bytes: two keys of one byte, numbers of up to 5 and 10 bytes.
+const HOPS_AND_AGE_BYTES: usize = 17;
 
 /// Why bytes that claim to be a frame are none.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -53,7 +55,7 @@ pub enum FrameError {
         /// Bytes that the prefix promises.
         needed: usize,
     },
-    /// The header is longer than allowed.
+    /// The header, with the longest hops and age, is longer than allowed.
     #[error("header of {0} bytes, at most {MAX_HEADER_BYTES} are allowed")]
     HeaderTooLarge(usize),
     /// The payload is longer than allowed.
@@ -138,7 +140,8 @@ impl Frame {
         Ok(PREFIX_BYTES + length)
     }
 
-    /// A frame from its encoded prefix and header, and its payload, which may lie elsewhere.
+    /// A frame from its encoded prefix and header, and its payload, which may lie elsewhere. The
+    /// header must leave room for the longest hops and age: they grow on the way.
     ///
     /// # Errors
     /// What is wrong with it, see [`FrameError`].
@@ -151,6 +154,11 @@ impl Frame {
             return Err(FrameError::PayloadTooLarge(payload.len()));
         }
         let index = Index::read(&head[PREFIX_BYTES..])?;
+        let longest =
+            needed - PREFIX_BYTES - index.hops_at.len() - index.age_at.len() + HOPS_AND_AGE_BYTES;
+        if longest > MAX_HEADER_BYTES {
+            return Err(FrameError::HeaderTooLarge(longest));
+        }
         let (hops, age_us) = (index.encoded_hops, index.encoded_age_us);
         Ok(Self { head, payload, index, hops, age_us })
     }
@@ -169,7 +177,7 @@ impl Frame {
         &self.head
     }
 
-    /// Prefix and header with today's hops and age: what a writer to a broker sends before the
+    /// Prefix and header with the current hops and age: what a writer to a broker sends before the
     /// payload.
     #[must_use]
     pub fn head_to_write(&self) -> Bytes {
@@ -178,7 +186,7 @@ impl Frame {
             return self.head.clone();
         }
         let header = &self.head[PREFIX_BYTES..];
-        let mut out = BytesMut::with_capacity(self.head.len() + 20);
+        let mut out = BytesMut::with_capacity(self.head.len() + HOPS_AND_AGE_BYTES);
         out.put_slice(&MAGIC);
         out.put_u32_le(0);
         let mut cuts = [usize_range(&index.hops_at), usize_range(&index.age_at)];
@@ -197,12 +205,13 @@ impl Frame {
             encode_key(AGE_TAG, WireType::Varint, &mut out);
             encode_varint(self.age_us, &mut out);
         }
+        // At most `MAX_HEADER_BYTES`, as `from_parts` has checked: this never fails.
         let length = u32::try_from(out.len() - PREFIX_BYTES).unwrap_or(u32::MAX);
         out[4..PREFIX_BYTES].copy_from_slice(&length.to_le_bytes());
         out.freeze()
     }
 
-    /// The whole frame in one piece, with today's hops and age. Copies the payload.
+    /// The whole frame in one piece, with the current hops and age. Copies the payload.
     #[must_use]
     pub fn to_bytes(&self) -> Bytes {
         let head = self.head_to_write();
@@ -220,7 +229,7 @@ impl Frame {
 
     /// Bytes of the frame as it came: head and payload.
     #[must_use]
-    pub fn wire_len(&self) -> usize {
+    pub fn received_len(&self) -> usize {
         self.head.len() + self.payload.len()
     }
 

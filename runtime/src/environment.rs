@@ -4,7 +4,7 @@ use std::fmt::Display;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use crate::config::{LocatedFault, Place};
+use crate::config::{LocatedFault, ValueOrigin};
 
 /// A variable; `None` if it is absent, empty or not UTF-8.
 #[must_use]
@@ -19,7 +19,7 @@ pub fn variable(name: &str) -> Option<String> {
 /// What is wrong with it, to be told with the faults of the configuration.
 pub fn parsed<T: FromStr<Err: Display>>(name: &str) -> Result<Option<T>, LocatedFault> {
     let fault = |error: T::Err| LocatedFault {
-        place: Place::Environment(Arc::from(name)),
+        place: ValueOrigin::Environment(Arc::from(name)),
         path: String::new(),
         detail: error.to_string(),
     };

@@ -157,7 +157,7 @@ impl Message {
     /// Bytes that it holds in memory.
     pub(crate) fn size(&self) -> usize {
         match &self.body {
-            Body::Framed(frame) => frame.wire_len(),
+            Body::Framed(frame) => frame.received_len(),
             Body::Bare { payload, .. } => payload.len(),
         }
     }

@@ -1,9 +1,11 @@
-//! Threads that run callbacks.
+//! Pool that runs subscription callbacks.
 //!
 //! ```text
-//! subscriptions ── tickets ──► ready queue ──► base threads (as many as cores)
+//! subscriptions ── tickets ──► ready queue ──► base threads
 //!                                         └──► spare threads, while callbacks keep all others busy
 //! ```
+//!
+//! Base threads: `pool_threads`; default: number of cores, at least 2.
 //!
 //! A ticket is "this subscription has something to run"; its job runs one callback and is put back
 //! at the end of the queue if there is more, so subscriptions take turns. When nothing was taken
@@ -58,7 +60,7 @@ struct State {
     taken: u64,
     /// Threads that wait for work; each will take one job of the queue.
     idle: usize,
-    /// The watching thread looks at the queue by itself, it needs no call.
+    /// The watch thread is in its 50 ms check and needs no wake-up.
     watching: bool,
     spare: usize,
     stopped: bool,

@@ -3,7 +3,7 @@
 //! away.
 //!
 //! ```text
-//! main service ──Sync──▶ core::Replica ──▶ core::Served ──▶ answers and notices on the local broker
+//! main service ──Sync──▶ core::LayerView ──▶ core::Served ──▶ answers and notices on the local broker
 //!                            │   ▲
 //!                            ▼   │ at the start: last-known-good file or MongoDB, else mounted file
 //!                          copy::Copies

@@ -15,7 +15,7 @@ use bytes::Bytes;
 use serde_json::json;
 use tokio::sync::{mpsc, watch};
 
-use crate::core::Place;
+use crate::core::ServedTarget;
 use crate::engine::{Own, Sign};
 
 /// Between two acknowledgements: each counts for a while.
@@ -23,7 +23,7 @@ const AGAIN: Duration = Duration::from_secs(60);
 
 /// What BlazeConfig says of the worker, and what became of it.
 pub struct OwnConfig {
-    place: Place,
+    place: ServedTarget,
     overlays: watch::Receiver<Option<Overlay>>,
     ack: watch::Sender<Option<Bytes>>,
 }
@@ -35,7 +35,7 @@ impl OwnConfig {
         node: &NodeName,
         instance: InstanceName,
     ) -> anyhow::Result<(Self, Own, watch::Receiver<Option<Bytes>>)> {
-        let place = Place {
+        let place = ServedTarget {
             service: "blaze-worker".parse().context("the name of the program")?,
             instance: Some(instance),
             node: Some(node.clone()),

@@ -3,6 +3,7 @@
 //! again.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -36,12 +37,14 @@ type Key = (Arc<str>, String);
 #[derive(Default)]
 pub(super) struct KeyedWriter {
     waiting: Mutex<Pending<Key, Entry>>,
+    /// Values for which there was no room.
+    dropped: AtomicU64,
     filled: Notify,
 }
 
 impl KeyedWriter {
-    /// Writes a value when the server can be reached; an older one of the key that still waits is
-    /// forgotten.
+    /// Writes a value when the server can be reached, in place of an older one of the key that
+    /// still waits.
     pub(super) fn put(
         &self,
         topic: &Arc<Topic>,
@@ -50,7 +53,15 @@ impl KeyedWriter {
         value: Option<Bytes>,
     ) {
         let entry = Entry { topic: Arc::clone(topic), partition, value };
-        self.waiting.lock().put((Arc::clone(&topic.name), key), entry);
+        if !self.waiting.lock().put((Arc::clone(&topic.name), key), entry) {
+            let dropped = self.dropped.fetch_add(1, Ordering::Relaxed) + 1;
+            if dropped.is_power_of_two() {
+                tracing::warn!(
+                    dropped,
+                    "too many lease changes wait for Kafka: the newest are lost"
+                );
+            }
+        }
         self.filled.notify_one();
     }
 

@@ -12,7 +12,7 @@ use rdkafka::message::{BorrowedMessage, Headers as _, Message as _, Timestamp};
 
 use super::clock::BrokerClock;
 use super::record;
-use crate::port::{Content, Place, Received};
+use crate::port::{ConsumerOffset, Content, Received};
 
 /// A record as it goes to readers.
 pub(super) fn receive(
@@ -28,7 +28,7 @@ pub(super) fn receive(
         Timestamp::CreateTime(_) | Timestamp::NotAvailable => None,
     };
     let broker_age_us = appended_ms.map_or(0, |appended| clock.lock().age_us(appended, at));
-    let place = usize::try_from(message.partition()).ok().map(|partition| Place {
+    let place = usize::try_from(message.partition()).ok().map(|partition| ConsumerOffset {
         partition,
         offset: message.offset(),
         appended_ms,

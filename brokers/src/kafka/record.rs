@@ -133,7 +133,7 @@ fn number<T: std::str::FromStr>(name: &'static str, value: Option<&[u8]>) -> Res
     }
 }
 
-/// Calls `add` with each header of a frame, with today's hops and age.
+/// Calls `add` with each header of a frame, with the current hops and age.
 pub(super) fn write(frame: &Frame, scratch: &mut String, mut add: impl FnMut(&'static str, &str)) {
     let mut put = |name, arguments: std::fmt::Arguments<'_>| {
         scratch.clear();

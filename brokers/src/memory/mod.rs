@@ -230,8 +230,10 @@ impl MemoryHub {
             && let Content::Frame(frame) = &message.content
         {
             let writer = (channel.name.clone(), frame.writer());
-            let (size, depth) =
-                (frame.wire_len() + OVERHEAD_BYTES, usize::try_from(depth).unwrap_or(usize::MAX));
+            let (size, depth) = (
+                frame.received_len() + OVERHEAD_BYTES,
+                usize::try_from(depth).unwrap_or(usize::MAX),
+            );
             let mut retained = self.shared.retained.lock();
             retained.keep(writer, (frame.clone(), message.at), size, depth);
         }

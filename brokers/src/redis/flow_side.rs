@@ -43,7 +43,7 @@ impl FlowSide for RedisFlowSide {
         let hash = self.shared.settings.names.last(channel);
         let key = (hash, writer);
         self.shared.mirror.lock().forget(&key);
-        self.leases.forget(key.0, writer);
+        self.leases.delete_retained(key.0, writer);
     }
 
     fn stand_back(&self, for_whom: Option<String>) {

@@ -1,5 +1,5 @@
-//! The flow's leases on the server: an own copy, what is still to be written, and the task that
-//! writes it.
+//! Write-behind queue to Redis: the flow's leases, and deletions of retained messages of removed
+//! writers.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -12,15 +12,15 @@ use redis::Cmd;
 use tokio::sync::Notify;
 
 use super::publisher::hset_command;
-use super::state::Scope;
+use super::state::ScopeOwnership;
 use super::{Shared, server};
 use crate::pending::Pending;
 use crate::port::BrokerError;
 
 /// Leases that are kept at most: a flow has 10,000, and some are on their way out.
 const MAX_LEASES: usize = 20_000;
-/// Writers that wait to be forgotten; the oldest give way.
-const MAX_FORGOTTEN: usize = 65_536;
+/// Deletions of retained messages that wait at most; the oldest give way.
+const MAX_DELETIONS: usize = 65_536;
 /// Commands that are sent together.
 const PER_BATCH: usize = 500;
 /// After a refusal the server is left alone for this long.
@@ -31,17 +31,17 @@ const LOAD: Duration = Duration::from_secs(10);
 /// A field of a hash, and what it is to hold; `None`: there is no such field.
 type Change = ((Arc<str>, String), Option<Bytes>);
 
-/// The leases, and what the server does not know of them, and of writers that are to be forgotten.
+/// The leases, what the server does not know of them, and retained messages that are to be deleted.
 #[derive(Debug)]
 pub(super) struct Ledger {
     /// Name of their hash.
     hash: Arc<str>,
     kept: HashMap<String, Bytes>,
     pending: Pending<(Arc<str>, String), Option<Bytes>>,
-    /// More changes were made than can wait: the hash is deleted before the leases are written.
+    /// The hash is deleted before the leases are written, see `replace_all`.
     clear_first: bool,
-    /// Fields of writers that are to be forgotten.
-    forgotten: VecDeque<(Arc<str>, String)>,
+    /// Fields of removed writers, in the hashes of retained messages.
+    deletions: VecDeque<(Arc<str>, String)>,
     /// The last batch is not settled.
     under_way: bool,
 }
@@ -61,7 +61,7 @@ impl Ledger {
             kept: HashMap::new(),
             pending: Pending::default(),
             clear_first: false,
-            forgotten: VecDeque::new(),
+            deletions: VecDeque::new(),
             under_way: false,
         }
     }
@@ -83,30 +83,30 @@ impl Ledger {
 
     fn note(&mut self, key: &str, value: Option<Bytes>) {
         if !self.pending.put(self.field(key), value) {
-            self.write_anew();
+            self.replace_all();
         }
     }
 
-    /// Of changes that are too many only the outcome is written.
-    fn write_anew(&mut self) {
+    /// The queue of changes is full: delete the hash and write all current leases. They fit:
+    /// `MAX_LEASES` < `MAX_PENDING`, so this does not recurse.
+    fn replace_all(&mut self) {
         self.clear_first = true;
         self.pending.clear();
-        // These fit.
         self.rewrite_all();
     }
 
-    fn forget(&mut self, hash: Arc<str>, writer: WriterId) {
-        if self.forgotten.len() >= MAX_FORGOTTEN {
-            self.forgotten.pop_front();
+    fn delete_retained(&mut self, hash: Arc<str>, writer: WriterId) {
+        if self.deletions.len() >= MAX_DELETIONS {
+            self.deletions.pop_front();
         }
-        self.forgotten.push_back((hash, writer.to_string()));
+        self.deletions.push_back((hash, writer.to_string()));
     }
 
     /// The next changes; those of the call before are settled: written, or put back.
     fn take(&mut self) -> Option<Batch> {
         let mut changes = self.pending.take(PER_BATCH, |_| true);
-        let room = (PER_BATCH - changes.len()).min(self.forgotten.len());
-        changes.extend(self.forgotten.drain(..room).map(|field| (field, None)));
+        let room = (PER_BATCH - changes.len()).min(self.deletions.len());
+        changes.extend(self.deletions.drain(..room).map(|field| (field, None)));
         let clears = std::mem::take(&mut self.clear_first);
         self.under_way = clears || !changes.is_empty();
         self.under_way.then_some(Batch { clears, changes })
@@ -115,11 +115,11 @@ impl Ledger {
     /// Changes that may not have arrived wait again.
     fn put_back(&mut self, batch: Batch) {
         let is_lease = |((hash, _), _): &Change| *hash == self.hash;
-        let (leases, forgotten): (Vec<_>, Vec<_>) = batch.changes.into_iter().partition(is_lease);
-        for (field, _) in forgotten.into_iter().rev() {
-            self.forgotten.push_front(field);
+        let (leases, deletions): (Vec<_>, Vec<_>) = batch.changes.into_iter().partition(is_lease);
+        for (field, _) in deletions.into_iter().rev() {
+            self.deletions.push_front(field);
         }
-        // Otherwise all that counts was queued meanwhile.
+        // Otherwise all current leases were queued meanwhile.
         if !self.clear_first {
             self.pending.put_back(leases);
         }
@@ -130,21 +130,21 @@ impl Ledger {
         !self.under_way
             && !self.clear_first
             && self.pending.is_settled()
-            && self.forgotten.is_empty()
+            && self.deletions.is_empty()
     }
 
     fn field(&self, key: &str) -> (Arc<str>, String) {
         (Arc::clone(&self.hash), key.to_owned())
     }
 
-    /// The server may have lost everything.
+    /// Writes all current leases again: the server may have lost them.
     pub(super) fn rewrite_all(&mut self) {
         let (hash, pending) = (&self.hash, &mut self.pending);
         let mut all = self.kept.iter();
         if !all
             .all(|(key, value)| pending.put((Arc::clone(hash), key.clone()), Some(value.clone())))
         {
-            self.write_anew();
+            self.replace_all();
         }
     }
 
@@ -191,9 +191,9 @@ impl Leases {
         self.wake();
     }
 
-    /// A writer's field of what is kept for late joiners goes.
-    pub(super) fn forget(&self, hash: Arc<str>, writer: WriterId) {
-        self.ledger.lock().forget(hash, writer);
+    /// Deletes the retained message of a removed writer.
+    pub(super) fn delete_retained(&self, hash: Arc<str>, writer: WriterId) {
+        self.ledger.lock().delete_retained(hash, writer);
         self.wake();
     }
 
@@ -231,7 +231,7 @@ async fn write_on(shared: &Shared, leases: &Leases) {
 }
 
 fn is_owned(shared: &Shared) -> bool {
-    shared.state.read(|conditions| *conditions.scope() == Scope::Owned)
+    shared.state.read(|conditions| *conditions.scope() == ScopeOwnership::Owned)
 }
 
 /// Waits until the server has all changes, if it takes any.
@@ -371,13 +371,16 @@ mod tests {
         assert!(batch.clears, "it may not have arrived");
         assert_eq!(batch.changes.len(), 1);
         assert!(ledger.take().is_none() && ledger.is_settled());
-        for number in 0..=MAX_FORGOTTEN {
-            ledger.forget(Arc::from("other"), WriterId([u8::try_from(number % 200).unwrap(); 16]));
+        for number in 0..=MAX_DELETIONS {
+            ledger.delete_retained(
+                Arc::from("other"),
+                WriterId([u8::try_from(number % 200).unwrap(); 16]),
+            );
         }
-        assert_eq!(ledger.forgotten.len(), MAX_FORGOTTEN);
+        assert_eq!(ledger.deletions.len(), MAX_DELETIONS);
         let batch = ledger.take().unwrap();
         assert!(!batch.clears && batch.changes.len() == PER_BATCH);
         ledger.put_back(batch);
-        assert_eq!(ledger.forgotten.len(), MAX_FORGOTTEN, "what was refused waits again");
+        assert_eq!(ledger.deletions.len(), MAX_DELETIONS, "what was refused waits again");
     }
 }

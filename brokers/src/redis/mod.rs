@@ -62,7 +62,7 @@ use owner::Owner;
 use publisher::Target;
 use server::{BufferLimits, ServerFacts};
 use settings::Settings;
-use state::{Line, LineState, Scope, State};
+use state::{Line, LineState, ScopeOwnership, State};
 use subscriptions::Subscriptions;
 
 /// How long closing delivers what was taken.
@@ -105,8 +105,8 @@ impl Shared {
     fn new(settings: Settings, role: &Role) -> Self {
         let gates = [Gate::new(false), Gate::new(true)];
         let scope = match role {
-            Role::Service | Role::Worker => Scope::Free,
-            Role::Flow { .. } => Scope::Unclaimed,
+            Role::Service | Role::Worker => ScopeOwnership::Free,
+            Role::Flow { .. } => ScopeOwnership::Unclaimed,
         };
         let channels = Arc::<AtomicUsize>::default();
         Self {

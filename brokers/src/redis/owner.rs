@@ -16,7 +16,7 @@ use redis::{RedisResult, Script};
 use super::Shared;
 use super::leases::Leases;
 use super::server;
-use super::state::Scope;
+use super::state::ScopeOwnership;
 
 /// Between two renewals.
 const RENEW: Duration = Duration::from_secs(1);
@@ -139,7 +139,7 @@ impl Owner {
         self.renewed = None;
         self.shared
             .state
-            .set_scope(Scope::Lost("the scope could not be renewed for 4 s".to_owned()));
+            .set_scope(ScopeOwnership::Lost("the scope could not be renewed for 4 s".to_owned()));
         future.await
     }
 
@@ -152,21 +152,21 @@ impl Owner {
                 // An older answer says nothing of now; the next claim follows at once.
                 if sent.elapsed() < GIVE_UP {
                     self.renewed = Some(sent);
-                    self.shared.state.set_scope(Scope::Owned);
+                    self.shared.state.set_scope(ScopeOwnership::Owned);
                     self.leases.wake();
                 }
             }
             Ok(Claim::Held(whom)) => {
                 self.renewed = None;
-                self.shared.state.set_scope(Scope::HeldBy(whom));
+                self.shared.state.set_scope(ScopeOwnership::HeldBy(whom));
             }
             Err(error) if server::is_refusal(&error) => {
                 // Refused once is not yet refused for good: a server that loads its data says no
                 // for a moment.
                 if self.renewed.is_none() {
-                    self.shared
-                        .state
-                        .set_scope(Scope::Lost(format!("the scope cannot be claimed: {error}")));
+                    self.shared.state.set_scope(ScopeOwnership::Lost(format!(
+                        "the scope cannot be claimed: {error}"
+                    )));
                 }
             }
             // The connection was lost, which its own task tells.
@@ -188,7 +188,8 @@ async fn due(shared: &Shared, sent: Instant) {
         tokio::time::sleep(SOON).await;
         loop {
             version.mark_unchanged();
-            let unclaimed = shared.state.read(|conditions| *conditions.scope() == Scope::Unclaimed);
+            let unclaimed =
+                shared.state.read(|conditions| *conditions.scope() == ScopeOwnership::Unclaimed);
             if unclaimed && shared.commands_now().is_some() {
                 return;
             }
@@ -220,7 +221,7 @@ async fn claim(
 
 /// Ends the ownership, if it is ours, so that the next owner need not wait.
 pub(super) async fn release(shared: &Shared, flow: &str, epoch: u64) {
-    if shared.state.read(|conditions| *conditions.scope() != Scope::Owned) {
+    if shared.state.read(|conditions| *conditions.scope() != ScopeOwnership::Owned) {
         return;
     }
     let Some(mut connection) = shared.commands_now() else {

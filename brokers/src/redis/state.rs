@@ -99,7 +99,7 @@ impl LineState {
 
 /// Whose scope it is, as far as the server told.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Scope {
+pub(super) enum ScopeOwnership {
     /// A service: the scope is none of its business.
     Free,
     /// A flow that has not claimed it yet.
@@ -116,7 +116,7 @@ pub(super) enum Scope {
 #[derive(Debug)]
 pub(super) struct Conditions {
     lines: [LineState; 4],
-    scope: Scope,
+    scope: ScopeOwnership,
     /// A flow to which this one gives way.
     pub(super) stand_back: Option<String>,
     /// Program and version of the server.
@@ -130,7 +130,7 @@ pub(super) struct Conditions {
 }
 
 impl Conditions {
-    fn new(scope: Scope, place: String) -> Self {
+    fn new(scope: ScopeOwnership, place: String) -> Self {
         // Those for large messages come with the first large publisher or reader.
         let start = |line: Line| {
             if line.is_large() { LineState::Unused } else { LineState::Starting }
@@ -160,19 +160,19 @@ impl Conditions {
         self.was_up |= self.core_is_up();
     }
 
-    pub(super) fn scope(&self) -> &Scope {
+    pub(super) fn scope(&self) -> &ScopeOwnership {
         &self.scope
     }
 
-    pub(super) fn set_scope(&mut self, scope: Scope) {
-        self.was_owned |= scope == Scope::Owned;
+    pub(super) fn set_scope(&mut self, scope: ScopeOwnership) {
+        self.was_owned |= scope == ScopeOwnership::Owned;
         self.scope = scope;
     }
 
     /// The server may have lost whose scope it is: until the next claim it is nobody's.
     pub(super) fn forget_owner(&mut self) {
-        if self.scope == Scope::Owned {
-            self.scope = Scope::Unclaimed;
+        if self.scope == ScopeOwnership::Owned {
+            self.scope = ScopeOwnership::Unclaimed;
         }
     }
 
@@ -184,7 +184,7 @@ impl Conditions {
     fn scope_open(&self) -> bool {
         !self.closed
             && self.stand_back.is_none()
-            && matches!(self.scope, Scope::Free | Scope::Owned)
+            && matches!(self.scope, ScopeOwnership::Free | ScopeOwnership::Owned)
     }
 
     /// Whether messages for a connection are taken.
@@ -209,13 +209,13 @@ impl Conditions {
             return in_use(whom);
         }
         match &self.scope {
-            Scope::Unclaimed => {
+            ScopeOwnership::Unclaimed => {
                 let health = if self.was_owned { Health::Down } else { Health::Connecting };
                 (health, format!("claiming the scope at {}", self.place))
             }
-            Scope::HeldBy(whom) => in_use(whom),
-            Scope::Lost(why) => (Health::Down, why.clone()),
-            Scope::Free | Scope::Owned => (Health::Up, self.server_detail()),
+            ScopeOwnership::HeldBy(whom) => in_use(whom),
+            ScopeOwnership::Lost(why) => (Health::Down, why.clone()),
+            ScopeOwnership::Free | ScopeOwnership::Owned => (Health::Up, self.server_detail()),
         }
     }
 
@@ -258,7 +258,7 @@ pub(super) struct State {
 }
 
 impl State {
-    pub(super) fn new(scope: Scope, place: String, gates: [Arc<Gate>; 2]) -> Self {
+    pub(super) fn new(scope: ScopeOwnership, place: String, gates: [Arc<Gate>; 2]) -> Self {
         let conditions = Conditions::new(scope, place);
         let (health, detail) = conditions.health();
         Self {
@@ -305,7 +305,7 @@ impl State {
     }
 
     /// Sets whose scope it is, if that is not known already.
-    pub(super) fn set_scope(&self, scope: Scope) {
+    pub(super) fn set_scope(&self, scope: ScopeOwnership) {
         if self.read(|conditions| *conditions.scope() != scope) {
             self.change(|conditions| conditions.set_scope(scope));
         }
@@ -361,7 +361,7 @@ impl State {
 mod tests {
     use super::*;
 
-    fn conditions(scope: Scope) -> Conditions {
+    fn conditions(scope: ScopeOwnership) -> Conditions {
         let mut conditions = Conditions::new(scope, "host:1".to_owned());
         conditions.server = "redis 7".to_owned();
         conditions
@@ -371,7 +371,7 @@ mod tests {
         LineState::Failed(Failure::away(why))
     }
 
-    fn up(scope: Scope) -> Conditions {
+    fn up(scope: ScopeOwnership) -> Conditions {
         let mut conditions = conditions(scope);
         conditions.set_line(Line::PublishSmall, LineState::Up);
         conditions.set_line(Line::ReadSmall, LineState::Up);
@@ -380,7 +380,7 @@ mod tests {
 
     #[test]
     fn up_needs_both_core_connections() {
-        let mut c = conditions(Scope::Free);
+        let mut c = conditions(ScopeOwnership::Free);
         assert_eq!(c.health().0, Health::Connecting);
         c.set_line(Line::PublishSmall, LineState::Up);
         assert_eq!(c.health().0, Health::Connecting);
@@ -401,7 +401,7 @@ mod tests {
 
     #[test]
     fn a_server_that_was_never_there_is_connecting_and_one_that_says_no_is_down() {
-        let mut c = conditions(Scope::Free);
+        let mut c = conditions(ScopeOwnership::Free);
         c.set_line(Line::ReadSmall, away("connection refused"));
         assert_eq!(c.health(), (Health::Connecting, "host:1: connection refused".to_owned()));
         let refused = Failure { is_refusal: true, why: "WRONGPASS".to_owned() };
@@ -411,7 +411,7 @@ mod tests {
 
     #[test]
     fn a_silent_server_is_down_and_takes_nothing() {
-        let mut c = up(Scope::Free);
+        let mut c = up(ScopeOwnership::Free);
         c.set_line(Line::PublishSmall, LineState::Silent);
         assert_eq!(c.health().0, Health::Down);
         assert!(!c.accepts(Line::PublishSmall));
@@ -420,20 +420,20 @@ mod tests {
     #[test]
     fn a_scope_that_is_not_ours_is_neither_read_nor_written() {
         for (scope, health) in [
-            (Scope::Unclaimed, Health::Connecting),
-            (Scope::HeldBy("edge/other".to_owned()), Health::InUse),
-            (Scope::Lost("not renewed".to_owned()), Health::Down),
+            (ScopeOwnership::Unclaimed, Health::Connecting),
+            (ScopeOwnership::HeldBy("edge/other".to_owned()), Health::InUse),
+            (ScopeOwnership::Lost("not renewed".to_owned()), Health::Down),
         ] {
             let c = up(scope.clone());
             assert_eq!(c.health().0, health, "{scope:?}");
             assert!(!c.scope_open() && !c.accepts(Line::PublishSmall), "{scope:?}");
         }
-        let mut c = up(Scope::Owned);
+        let mut c = up(ScopeOwnership::Owned);
         assert_eq!(c.health().0, Health::Up);
-        c.set_scope(Scope::Owned);
+        c.set_scope(ScopeOwnership::Owned);
         c.forget_owner();
         assert_eq!(c.health().0, Health::Down, "the server was restarted");
-        c.set_scope(Scope::Owned);
+        c.set_scope(ScopeOwnership::Owned);
         c.stand_back = Some("fog/first".to_owned());
         assert_eq!(c.health(), (Health::InUse, "scope_in_use: fog/first holds it".to_owned()));
         assert!(!c.accepts(Line::PublishSmall));
@@ -441,7 +441,7 @@ mod tests {
 
     #[test]
     fn interruptions_of_reading_are_counted() {
-        let mut c = up(Scope::Free);
+        let mut c = up(ScopeOwnership::Free);
         for _ in 0..2 {
             c.set_line(Line::ReadSmall, away("reset"));
             c.set_line(Line::ReadSmall, away("refused"));

@@ -13,7 +13,7 @@ use super::connection::Session;
 use super::gate::{Busy, Gate};
 use super::liveness::LOOK;
 use super::publisher::{Batch, Keeper, Refusals, Target};
-use super::state::{Failure, Line, LineState, Scope};
+use super::state::{Failure, Line, LineState, ScopeOwnership};
 use super::{Shared, server};
 use crate::outbox::Waiting;
 
@@ -133,7 +133,7 @@ impl<'a> Writer<'a> {
 
     /// A flow is told by the end of a lease; a service's publisher takes what it kept with it.
     fn forget(&self) {
-        if self.shared.state.read(|conditions| *conditions.scope() == Scope::Free) {
+        if self.shared.state.read(|conditions| *conditions.scope() == ScopeOwnership::Free) {
             self.shared.mirror.lock().forget_orphans();
         }
     }

@@ -1,4 +1,4 @@
-//! Asking whoever sits at the terminal before something is gone.
+//! Asking the user at the terminal before something is deleted.
 
 use std::io::{BufRead, IsTerminal as _, Write};
 

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use blaze_domain::config::{Key, json};
-use blaze_runtime::config::{LocatedFault, Place, located_documents};
+use blaze_runtime::config::{LocatedFault, ValueOrigin, located_documents};
 use blaze_runtime::state::read_small;
 use serde_json::Value;
 
@@ -227,10 +227,13 @@ fn is_quoted(text: &str) -> bool {
 /// The same fault with the name of the file.
 fn in_file(mut fault: LocatedFault, name: &str) -> LocatedFault {
     let line = match fault.place {
-        Place::File { line, .. } | Place::Line(line) => line,
-        Place::Nowhere | Place::Overlay { .. } | Place::Environment(_) | Place::Override(_) => 0,
+        ValueOrigin::File { line, .. } | ValueOrigin::Line(line) => line,
+        ValueOrigin::Nowhere
+        | ValueOrigin::Overlay { .. }
+        | ValueOrigin::Environment(_)
+        | ValueOrigin::Override(_) => 0,
     };
-    fault.place = Place::File { file: Arc::from(name), line };
+    fault.place = ValueOrigin::File { file: Arc::from(name), line };
     fault
 }
 

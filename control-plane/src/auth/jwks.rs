@@ -1,7 +1,7 @@
 //! Keys of an identity provider, fetched over HTTPS again and again.
 //!
-//! No redirects, no proxy, bounded time and size: whoever could lead this request elsewhere could
-//! sign tokens.
+//! No redirects, no proxy, bounded time and size: an attacker who could redirect this request
+//! could sign tokens.
 
 use std::error::Error;
 use std::time::Duration;

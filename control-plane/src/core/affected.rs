@@ -1,5 +1,5 @@
-//! Which places a set of changed documents can concern, and whose effective configuration really is
-//! another one.
+//! Which [targets](ConfigTarget) a set of changed documents can concern, and whose effective
+//! configuration really is another one.
 
 use std::collections::BTreeSet;
 use std::rc::Rc;
@@ -9,38 +9,39 @@ use blaze_domain::config::{Document, Key, Kind};
 use blaze_domain::{LayerName, NodeName, ServiceName};
 
 use super::view::View;
-use blaze_domain::config::effective::{At, Sources, canaries, is_canary};
+use blaze_domain::config::effective::{ConfigTarget, Sources, canaries, is_canary};
 use blaze_domain::config::placement::rollout_target;
 use blaze_domain::config::state::State;
 
-/// Places that are looked at for one request, at most: beyond it the answer would take longer than
+/// Targets that are looked at for one request, at most: beyond it the answer would take longer than
 /// it is worth.
 pub(crate) const MAX_CANDIDATES: usize = 200_000;
 /// The same for an answer that is kept with the commit: nobody can write while it is worked out.
 pub(crate) const MAX_KEPT_CANDIDATES: usize = 1000;
 
-/// Bytes of configurations that are merged and compared for each place that may be told, at most in
-/// the mean.
-const BYTES_PER_PLACE: usize = 64 * 1024;
+/// Bytes of configurations that are merged and compared for each target that may be told, at most
+/// on average.
+const BYTES_PER_TARGET: usize = 64 * 1024;
 /// The same for all of them.
 const MAX_BYTES: usize = 1024 * 1024 * 1024;
 
-/// Documents that are looked at for each place that may be found, at most.
-const LOOKS_PER_PLACE: usize = 25;
-/// The same for few places together.
+/// Documents that are read for each target that may be found, at most.
+const LOOKS_PER_TARGET: usize = 25;
+/// The same for few targets together.
 const LOOKS_AT_LEAST: usize = 1_000_000;
 
-/// A search for places that finds no more than so many, and looks at no more documents on the way
-/// than it may.
+/// A search for targets, up to so many, that reads a limited number of documents. The result may be
+/// incomplete when a limit is reached.
 struct Search<'s> {
     state: &'s State,
     /// Services that count.
     is_wanted: &'s dyn Fn(&ServiceName) -> bool,
     /// All of them, once they were needed.
     services: Option<Rc<[(ServiceName, &'s Document)]>>,
-    found: BTreeSet<At>,
+    found: BTreeSet<ConfigTarget>,
     limit: usize,
-    looks: usize,
+    /// Documents that may still be read.
+    looks_left: usize,
 }
 
 /// Instances with a document, and services without an instance at the layers and nodes that treat
@@ -57,7 +58,7 @@ fn candidates<'s>(
         services: None,
         found: BTreeSet::new(),
         limit,
-        looks: limit.saturating_mul(LOOKS_PER_PLACE).max(LOOKS_AT_LEAST),
+        looks_left: limit.saturating_mul(LOOKS_PER_TARGET).max(LOOKS_AT_LEAST),
     };
     for key in keys {
         search.of_key(key);
@@ -66,23 +67,24 @@ fn candidates<'s>(
 }
 
 impl<'s> Search<'s> {
-    fn is_full(&self) -> bool {
-        self.found.len() >= self.limit || self.looks == 0
+    /// Whether a limit is reached: the result may be incomplete.
+    fn is_exhausted(&self) -> bool {
+        self.found.len() >= self.limit || self.looks_left == 0
     }
 
-    fn add(&mut self, at: At) {
-        if !self.is_full() {
+    fn add(&mut self, at: ConfigTarget) {
+        if !self.is_exhausted() {
             self.found.insert(at);
         }
     }
 
-    /// Counts a document that is looked at.
+    /// Counts a document that is read.
     fn look(&mut self) {
-        self.looks = self.looks.saturating_sub(1);
+        self.looks_left = self.looks_left.saturating_sub(1);
     }
 
     fn of_key(&mut self, key: &Key) {
-        if self.is_full() {
+        if self.is_exhausted() {
             return;
         }
         let state = self.state;
@@ -106,7 +108,7 @@ impl<'s> Search<'s> {
                     None => Some(node.as_str()),
                 };
                 for service in self.services_of(seen_by) {
-                    self.add(At {
+                    self.add(ConfigTarget {
                         service: Some(service),
                         instance: None,
                         layer: layer.clone(),
@@ -133,7 +135,7 @@ impl<'s> Search<'s> {
         }
         let state = self.state;
         for (_, held) in state.instances(service) {
-            if self.is_full() {
+            if self.is_exhausted() {
                 return;
             }
             self.look();
@@ -146,7 +148,7 @@ impl<'s> Search<'s> {
 
     /// A node's or an instance's own places.
     fn of_placed(&mut self, key: &Key) {
-        if self.is_full() {
+        if self.is_exhausted() {
             return;
         }
         self.look();
@@ -177,15 +179,15 @@ impl<'s> Search<'s> {
                 .collect()
         });
         let all = Rc::clone(all);
-        self.looks = self.looks.saturating_sub(all.len());
+        self.looks_left = self.looks_left.saturating_sub(all.len());
         all.iter()
             .filter(|(_, document)| layer.is_none_or(|layer| document.is_for_layer(layer)))
             .map(|(name, _)| name.clone())
             .collect()
     }
 
-    /// A service without instance in a layer: on no node, on each node that has something of its
-    /// own to say, and on each where a roll-out tries a change of the service, the layer or the
+    /// A service without instance in a layer: on no node, on each node that has configuration
+    /// of its own, and on each where a roll-out tries a change of the service, the layer or the
     /// node.
     fn at_layer(&mut self, service: &ServiceName, layer: &LayerName) {
         let state = self.state;
@@ -193,23 +195,23 @@ impl<'s> Search<'s> {
             .get(&Key::service(service))
             .is_none_or(|held| held.document.is_for_layer(layer.as_str()));
         self.look();
-        if !visible || self.is_full() {
+        if !visible || self.is_exhausted() {
             return;
         }
-        let place = |node: Option<NodeName>| At {
+        let target = |node: Option<NodeName>| ConfigTarget {
             service: Some(service.clone()),
             instance: None,
             layer: Some(layer.clone()),
             node,
         };
-        self.add(place(None));
+        self.add(target(None));
         let tried: Vec<LabelSelector> = [Key::service(service), Key::layer(layer)]
             .iter()
             .flat_map(|target| state.active_on(target))
             .filter_map(|held| canaries(&held.document))
             .collect();
         for key in state.in_layer(layer) {
-            if self.is_full() {
+            if self.is_exhausted() {
                 return;
             }
             self.look();
@@ -217,39 +219,39 @@ impl<'s> Search<'s> {
                 continue;
             };
             let node = &held.document;
-            if own_word(node, service)
+            if has_own_config(node, service)
                 || tried.iter().any(|selector| selector.matches(&node.labels))
                 || state.active_on(key).any(|rollout| is_canary(&rollout.document, node))
             {
-                self.add(place(Some(NodeName::from(key.name()))));
+                self.add(target(Some(NodeName::from(key.name()))));
             }
         }
     }
 }
 
-/// Whether a node has something of its own to say to a service.
-fn own_word(node: &Document, service: &ServiceName) -> bool {
+/// Whether a node has configuration of its own for a service.
+fn has_own_config(node: &Document, service: &ServiceName) -> bool {
     let is_empty =
         |value: &serde_json::Value| value.as_object().is_some_and(serde_json::Map::is_empty);
     let overrides = node.overrides(service.as_str());
     [node.config(), overrides].into_iter().flatten().any(|config| !is_empty(config))
 }
 
-/// Places of wanted services whose effective configuration may be another one after the change;
+/// Targets of wanted services whose effective configuration may be another one after the change;
 /// `None` if they are more than `limit`, or too hard to find.
 pub(crate) fn touched(
     state: &State,
     keys: &[Key],
     is_wanted: &dyn Fn(&ServiceName) -> bool,
     limit: usize,
-) -> Option<BTreeSet<At>> {
+) -> Option<BTreeSet<ConfigTarget>> {
     // One more, to tell whether it is all of them.
     let search = candidates(state, keys, is_wanted, limit + 1);
-    (!search.is_full()).then_some(search.found)
+    (!search.is_exhausted()).then_some(search.found)
 }
 
-/// Places whose effective configuration is another one, in order, as far as they are seen. Of each
-/// state at most `limit` are looked at, and no more bytes of configurations than so many places
+/// Targets whose effective configuration is another one, in order, as far as they are seen. Of each
+/// state at most `limit` are looked at, and no more bytes of configurations than so many targets
 /// usually have.
 pub(crate) fn changed(
     before: &State,
@@ -257,12 +259,12 @@ pub(crate) fn changed(
     keys: &[Key],
     view: &View,
     limit: usize,
-) -> Vec<At> {
+) -> Vec<ConfigTarget> {
     let all = |_: &ServiceName| true;
-    let mut places = candidates(before, keys, &all, limit).found;
-    places.extend(candidates(after, keys, &all, limit).found);
-    let mut left = limit.saturating_mul(BYTES_PER_PLACE).min(MAX_BYTES);
-    places
+    let mut targets = candidates(before, keys, &all, limit).found;
+    targets.extend(candidates(after, keys, &all, limit).found);
+    let mut left = limit.saturating_mul(BYTES_PER_TARGET).min(MAX_BYTES);
+    targets
         .into_iter()
         .filter(|at| view.sees_place(before, at) || view.sees_place(after, at))
         .take_while(|at| {
@@ -279,7 +281,7 @@ pub(crate) fn changed(
 }
 
 /// Whether the service, and the instance if one is named, is there to have a configuration.
-fn exists(state: &State, at: &At) -> bool {
+fn exists(state: &State, at: &ConfigTarget) -> bool {
     let service = at.service.as_ref().is_some_and(|name| state.get(&Key::service(name)).is_some());
     match (&at.service, &at.instance) {
         (Some(service), Some(instance)) => {

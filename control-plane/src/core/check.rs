@@ -16,7 +16,7 @@ use super::cost::{MAX_WORK, MAX_WORK_OF_FAULTS, values};
 use super::pattern;
 use super::schema::{Compiled, Schemas, with_placeholders};
 use super::view::View;
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::state::State;
 
 /// Faults that are told, at most.
@@ -125,7 +125,7 @@ struct Check<'c> {
 }
 
 impl Check<'_> {
-    fn place(&mut self, at: &At) -> Result<(), TooLate> {
+    fn place(&mut self, at: &ConfigTarget) -> Result<(), TooLate> {
         if Instant::now() >= self.deadline {
             return Err(TooLate);
         }
@@ -156,7 +156,7 @@ impl Check<'_> {
     fn schema(
         &mut self,
         sources: &Sources,
-        at: &At,
+        at: &ConfigTarget,
         found: &mut Vec<FieldFault>,
     ) -> Result<(), TooLate> {
         let Some(compiled) = self.compiled(sources) else {
@@ -203,7 +203,7 @@ impl Check<'_> {
 
     /// Whether the configuration of a place was too costly to check before the change already:
     /// stored when more was allowed, it must not stand in the way of other changes.
-    fn was_too_costly(&mut self, at: &At) -> bool {
+    fn was_too_costly(&mut self, at: &ConfigTarget) -> bool {
         is_place(self.before, at) && {
             let sources = Sources::at(self.before, at);
             let compiled = self.compiled(&sources);
@@ -254,7 +254,7 @@ fn checked(sources: &Sources) -> (Value, HashSet<String>) {
 
 /// Whether a place is one whose configuration is checked: the instance is placed there, or the
 /// service may be seen there.
-fn is_place(state: &State, at: &At) -> bool {
+fn is_place(state: &State, at: &ConfigTarget) -> bool {
     let Some(service) = &at.service else { return false };
     if let Some(instance) = &at.instance {
         let held = state.get(&Key::instance(service.clone(), instance.clone()));
@@ -276,7 +276,7 @@ fn is_place(state: &State, at: &At) -> bool {
 
 /// A fault of which it would take too much to say where it is: a choice of subschemas tells what is
 /// wrong with each.
-fn some_fault(at: &At) -> FieldFault {
+fn some_fault(at: &ConfigTarget) -> FieldFault {
     FieldFault {
         pointer: "/spec/config".to_owned(),
         code: Code::SchemaMismatch,
@@ -290,7 +290,7 @@ fn some_fault(at: &At) -> FieldFault {
     }
 }
 
-fn mismatch(error: &ValidationError<'_>, at: &At) -> FieldFault {
+fn mismatch(error: &ValidationError<'_>, at: &ConfigTarget) -> FieldFault {
     let found: String = error.masked().to_string().chars().take(300).collect();
     FieldFault {
         pointer: format!("/spec/config{}", error.instance_path().as_str()),
@@ -300,7 +300,7 @@ fn mismatch(error: &ValidationError<'_>, at: &At) -> FieldFault {
     }
 }
 
-fn too_costly(at: &At, steps: u64, values: u64) -> FieldFault {
+fn too_costly(at: &ConfigTarget, steps: u64, values: u64) -> FieldFault {
     FieldFault {
         pointer: "/spec/config".to_owned(),
         code: Code::ValidationFailed,
@@ -328,7 +328,7 @@ pub(super) fn too_many() -> FieldFault {
     }
 }
 
-fn size_fault(sources: &Sources, at: &At) -> Option<FieldFault> {
+fn size_fault(sources: &Sources, at: &ConfigTarget) -> Option<FieldFault> {
     let bytes = sources.merged().to_string().len();
     (bytes > MAX_EFFECTIVE_BYTES).then(|| FieldFault {
         pointer: "/spec/config".to_owned(),
@@ -342,7 +342,7 @@ fn size_fault(sources: &Sources, at: &At) -> Option<FieldFault> {
     })
 }
 
-fn described(at: &At) -> String {
+fn described(at: &ConfigTarget) -> String {
     let mut out = at.service.as_ref().map(ToString::to_string).unwrap_or_default();
     if let Some(instance) = &at.instance {
         out.push_str(&format!("/{instance}"));

@@ -13,7 +13,7 @@ use super::affected;
 use super::evaluate::Evaluated;
 use super::types::{ApplyAction, ApplyReport, ApplyResult, Place, Written};
 use super::view::View;
-use blaze_domain::config::effective::At;
+use blaze_domain::config::effective::ConfigTarget;
 use blaze_domain::config::state::State;
 
 /// Places that are named in an answer.
@@ -117,7 +117,7 @@ impl Done {
     }
 }
 
-pub(crate) fn place(at: At) -> Place {
+pub(crate) fn place(at: ConfigTarget) -> Place {
     Place {
         service: at.service,
         instance: at.instance.as_ref().map(InstanceName::from),

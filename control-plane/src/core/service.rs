@@ -1,4 +1,4 @@
-//! The use cases, as REST and gRPC call them. Every right is checked here, whoever asks.
+//! The use cases, as REST and gRPC call them. Every right is checked here, for every caller.
 
 mod canaries;
 mod history;

@@ -5,7 +5,7 @@ use blaze_domain::LayerName;
 use blaze_domain::config::{Code, Document, Key, Kind, Problem};
 
 use crate::auth::{Claims, Right, Role, allowed, unbound};
-use blaze_domain::config::effective::At;
+use blaze_domain::config::effective::ConfigTarget;
 use blaze_domain::config::placement::{Placement, placement, rollout_target};
 use blaze_domain::config::state::State;
 
@@ -77,7 +77,7 @@ impl View {
 
     /// Whether the effective configuration at a place may be told of: that of a service or instance
     /// that is seen, in the layer itself or nowhere in particular.
-    pub(crate) fn sees_place(&self, state: &State, at: &At) -> bool {
+    pub(crate) fn sees_place(&self, state: &State, at: &ConfigTarget) -> bool {
         let Some(layer) = &self.layer else { return true };
         let sees = |key: &Key| {
             state.get(key).is_some_and(|held| self.sees_document(state, &held.document))

@@ -1,8 +1,8 @@
 //! LZ4 blocks: payloads are compressed for the inter scope, and what comes from there is taken
 //! apart with distrust.
 //!
-//! A block does not say how long it was; the message header does (`uncompressed_bytes`). Whoever
-//! sent it may have written any number there and any bytes after it, so nothing is believed: the
+//! A block does not say how long it was; the message header does (`uncompressed_bytes`). The
+//! sender may have written any number there and any bytes after it, so nothing is believed: the
 //! size is checked before memory is taken for it, and the result must have that size exactly.
 
 use ::lz4::block::{CompressionMode, compress_to_buffer, decompress_to_buffer};

@@ -1,4 +1,4 @@
-//! Compression of payloads for the inter scope (F8).
+//! Compression of payloads for the inter scope.
 //!
 //! ```text
 //!                 effort: at which level? ◄──────────── what it cost
@@ -9,8 +9,8 @@
 //!
 //! Each part is whole by itself: [`lz4`] is the codec, [`order`] keeps messages in order while some
 //! of them are with the pool, and says whose turn it is, [`pool`] are the threads, and [`effort`]
-//! picks the level. What connects them is [`press`](crate::lane::press), without threads, and
-//! [`plane`](crate::flow::plane).
+//! picks the level. What connects them is [`compress_stage`](crate::lane::compress_stage), without
+//! threads, and [`plane`](crate::flow::plane).
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};

@@ -10,8 +10,8 @@
 //! before it have left; other lines do not notice. Who is begun with next goes in rounds: one place
 //! of each group, and within a group one of each line, so that nobody who has much to do keeps the
 //! others waiting. A place that gives way to a newer one of its line leaves its turn to that.
-//! Without clock, threads or locks: whoever owns it holds it behind a lock of his own. Everything
-//! costs O(log n) in the places of one line at most.
+//! Without clock, threads or locks: the owner holds it behind a lock. Everything costs O(log n) in
+//! the places of one line at most.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::Hash;

@@ -1,7 +1,7 @@
 //! Threads that compress and decompress.
 //!
 //! ```text
-//! offer ─► turns: [ quick ] ─┬─► threads (as many as processors) ─► whoever owns the pool finds out what is to be done
+//! offer ─► turns: [ quick ] ─┬─► threads (as many as processors) ─► the pool's owner finds out what is to be done
 //!                 [ long  ] ─┘
 //! ```
 //!

@@ -1,4 +1,4 @@
-//! What becomes of a payload, whoever does it.
+//! What becomes of a payload, on any thread.
 
 use super::*;
 

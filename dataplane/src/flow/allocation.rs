@@ -106,7 +106,7 @@ fn rate_of(capacity: LinkCapacity) -> LinkRate {
         (Some(carries), _) => LinkRate::Carries(carries),
         (None, State::Unknown) => LinkRate::Free,
         (None, State::SlowStart | State::Steady | State::BackingOff) => {
-            LinkRate::Passing(capacity.bytes_per_s)
+            LinkRate::Ramping(capacity.bytes_per_s)
         }
     }
 }

@@ -167,12 +167,12 @@ impl Page {
         for (reason, count) in path.ingress_drops.iter() {
             self.add("blaze_flow_dropped_total", &[topic, "", reason.as_str()], count as f64);
         }
-        let press = &path.press;
-        if press.messages > 0 {
-            for (stage, bytes) in [("before", press.before), ("after", press.after)] {
+        let stats = &path.compress_stats;
+        if stats.messages > 0 {
+            for (stage, bytes) in [("before", stats.before), ("after", stats.after)] {
                 self.add("blaze_flow_compression_bytes_total", &[topic, stage], bytes as f64);
             }
-            self.add("blaze_flow_compression_seconds", &[topic], press.seconds);
+            self.add("blaze_flow_compression_seconds", &[topic], stats.seconds);
             // Topics that share a label have no level in common.
             if topic != OTHER {
                 self.add("blaze_flow_compression_level", &[topic], f64::from(path.level()));
@@ -327,17 +327,17 @@ impl Page {
         let Some(pool) = shared.plane.codec().map(CodecPool::counters) else {
             return;
         };
-        let press = shared.plane.read(|state| state.core.press_counters());
+        let stage = shared.plane.read(|state| state.core.compress_counters());
         for (state, value) in [
             ("threads", pool.threads),
             ("busy", pool.working),
-            ("waiting", press.waiting),
-            ("waiting_bytes", press.waiting_bytes),
+            ("waiting", stage.waiting),
+            ("waiting_bytes", stage.waiting_bytes),
         ] {
             self.add("blaze_flow_compression_pool", &[state], value as f64);
         }
         self.add("blaze_flow_compression_pool_seconds", &[], pool.busy.as_secs_f64());
-        self.count(&[("compression_refused", press.refused), ("compression_failed", press.failed)]);
+        self.count(&[("compression_refused", stage.refused), ("compression_failed", stage.failed)]);
     }
 
     fn fill_control(&self, shared: &Shared) {

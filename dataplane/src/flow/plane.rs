@@ -2,7 +2,7 @@
 //!
 //! Source tasks, the transport's reader threads and the pacer take the lock once per batch or
 //! datagram and never while they wait. What the link has to say to the control core is put into a
-//! bounded inbox. A thread of the compression pool takes it twice in each of its turns, to see what
+//! bounded inbox. A thread of the compression pool takes it twice for each of its jobs, to see what
 //! is to be done and to say what came of it, and not in between.
 
 use std::collections::VecDeque;
@@ -18,10 +18,10 @@ use tokio::sync::Notify;
 
 use crate::codec::pool::{CodecPool, Spawner, Urgency};
 use crate::codec::{Done, Work, guarded};
+use crate::lane::compress_stage::{CodecJob, CodecTicket, PoolRequests};
 use crate::lane::core::DataCore;
 use crate::lane::load::Loads;
 use crate::lane::path::TopicId;
-use crate::lane::press::{PressJob, PressTicket, Turns};
 use crate::link::transport::{Endpoint, TransportEvent};
 use crate::link::{Engine, LinkEvent, Transmit};
 
@@ -94,14 +94,14 @@ impl PlaneState {
         self.core.ingest(now, wall_ns, topic, from, batch, &mut self.engine);
     }
 
-    /// A thread of the pool has a turn.
-    pub fn begin(&mut self, now: Instant, urgency: Urgency) -> Option<PressJob> {
+    /// A pool thread takes the next job.
+    pub fn begin(&mut self, now: Instant, urgency: Urgency) -> Option<CodecJob> {
         self.core.begin(now, urgency, &mut self.engine)
     }
 
-    /// Takes what came of a turn.
-    pub fn pressed(&mut self, now: Instant, ticket: PressTicket, done: Done) {
-        self.core.pressed(now, ticket, done, &mut self.engine);
+    /// Takes the result of a job.
+    pub fn finished(&mut self, now: Instant, ticket: CodecTicket, done: Done) {
+        self.core.finished(now, ticket, done, &mut self.engine);
     }
 
     /// There is no pool any more.
@@ -199,8 +199,8 @@ impl Plane {
 
     /// Does something under the lock, carries out what the link then wants, and wakes the pacer.
     pub fn with<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> R {
-        let (result, turns) = self.locked(action);
-        self.hand_out(turns);
+        let (result, requests) = self.locked(action);
+        self.hand_out(requests);
         result
     }
 
@@ -209,9 +209,9 @@ impl Plane {
         self.with(|state| state.engine.as_mut().map(action))
     }
 
-    /// As [`Plane::with`]; the turns at the codec are left to the caller.
-    fn locked<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> (R, Turns) {
-        let (result, told, turns) = {
+    /// As [`Plane::with`]; requests to the pool are left to the caller.
+    fn locked<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> (R, PoolRequests) {
+        let (result, told, requests) = {
             let mut state = self.state.lock();
             let result = action(&mut state);
             // Told under the lock: who is up and who is down must reach the control core in the
@@ -221,13 +221,13 @@ impl Plane {
                 told = true;
                 self.tell(event);
             });
-            (result, told, state.core.take_turns())
+            (result, told, state.core.take_pool_requests())
         };
         self.work.notify_one();
         if told {
             self.news_waits.notify_one();
         }
-        (result, turns)
+        (result, requests)
     }
 
     /// Payloads are compressed from now on, by so many threads.
@@ -242,8 +242,8 @@ impl Plane {
         let plane = Weak::clone(&self.this);
         let pool = CodecPool::start(threads, spawner, move |urgency| {
             if let Some(plane) = plane.upgrade() {
-                let turns = plane.take_turn(|state| state.begin(Instant::now(), urgency));
-                plane.hand_out(turns);
+                let requests = plane.run_job(|state| state.begin(Instant::now(), urgency));
+                plane.hand_out(requests);
             }
         })?;
         if self.codec.set(Codec { pool, run }).is_ok() {
@@ -266,32 +266,32 @@ impl Plane {
         }
     }
 
-    /// One turn: what is to be done is done without the lock. A panic of the codec ends there; one
-    /// of the message path ends the thread, and with it the process. Returns the turns that follow.
-    fn take_turn(&self, begin: impl FnOnce(&mut PlaneState) -> Option<PressJob>) -> Turns {
+    /// Runs one job; the codec works without the lock. A panic of the codec ends there; one of the
+    /// message path ends the thread, and with it the process. Returns the requests that follow.
+    fn run_job(&self, begin: impl FnOnce(&mut PlaneState) -> Option<CodecJob>) -> PoolRequests {
         let Some(codec) = self.codec.get() else {
-            return Turns::default();
+            return PoolRequests::default();
         };
-        let (job, mut turns) = self.locked(begin);
-        if let Some(PressJob { ticket, payload, work }) = job {
+        let (job, mut requests) = self.locked(begin);
+        if let Some(CodecJob { ticket, payload, work }) = job {
             let done = guarded(|| (codec.run)(work, &payload));
-            let ((), more) = self.locked(|state| state.pressed(Instant::now(), ticket, done));
-            turns += more;
+            let ((), more) = self.locked(|state| state.finished(Instant::now(), ticket, done));
+            requests += more;
         }
         turns
     }
 
-    /// Offers turns to the pool, and takes those that are the caller's. Called without the lock.
-    fn hand_out(&self, mut turns: Turns) {
-        while turns != Turns::default() {
+    /// Passes requests to the pool, and runs those for the caller. Called without the lock.
+    fn hand_out(&self, mut requests: PoolRequests) {
+        while requests != PoolRequests::default() {
             if let Some(codec) = self.codec.get() {
-                codec.pool.offer(turns.quick, turns.long);
+                codec.pool.offer(requests.quick, requests.long);
             }
-            let mut more = Turns::default();
-            for _ in 0..turns.own {
-                more += self.take_turn(|state| state.core.begin_own());
+            let mut more = PoolRequests::default();
+            for _ in 0..requests.by_caller {
+                more += self.run_job(|state| state.core.begin_by_caller());
             }
-            turns = more;
+            requests = more;
         }
     }
 
@@ -357,7 +357,7 @@ impl Plane {
         next: impl Fn(&mut Engine, Instant) -> Option<Transmit>,
     ) -> Next {
         let mut told = false;
-        let (next, turns) = {
+        let (next, requests) = {
             let mut state = self.state.lock();
             let now = Instant::now();
             let due = state.run_timers(now);
@@ -369,7 +369,7 @@ impl Plane {
             let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
             state.pump(now, &mut tell);
             let paced = state.engine.as_ref().and_then(Engine::paced_until);
-            if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_turns() {
+            if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_pool_requests() {
                 let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
                 self.work.wait_until(&mut state, until);
             }
@@ -378,9 +378,9 @@ impl Plane {
                 None if paced.is_some() => Next::HeldBack,
                 None => Next::Nothing,
             };
-            (next, state.core.take_turns())
+            (next, state.core.take_pool_requests())
         };
-        self.hand_out(turns);
+        self.hand_out(requests);
         if told {
             self.news_waits.notify_one();
         }

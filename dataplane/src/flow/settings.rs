@@ -7,7 +7,7 @@ use blaze_domain::node_file::{
 };
 use blaze_domain::{FlowId, LayerKind};
 
-use crate::lane::press::CompressionRules;
+use crate::lane::compress_stage::CompressionRules;
 use crate::link::dds::Wire;
 use crate::plan::PlanRules;
 

@@ -1,4 +1,5 @@
-//! What the allocator of F9 is told of the lanes, and what its word means for them.
+//! What the allocator (`docs/design/bandwidth.md`) is told of the lanes, and what its rates mean
+//! for them.
 //!
 //! A lane is all of a topic that goes to one receiver: what is published on the node scope and what
 //! is published on the layer scope share it, its rate and its bucket.
@@ -14,10 +15,10 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, FlowId, LayerName, TopicName};
 
+use super::compress_stage::CompressStats;
 use super::core::DataCore;
 use super::measure::{LatencyHistogram, WINDOW};
 use super::path::{BridgeState, Phase, TopicId, TopicPath};
-use super::press::PressStats;
 use crate::limit::allocate::Class;
 use crate::limit::bucket::TokenBucket;
 use crate::limit::rates::{Demand, LaneDemand, Rates};
@@ -238,7 +239,7 @@ pub struct TopicFacts {
     /// Published for its lanes, in Hz.
     pub published_hz: f64,
     /// What compression did.
-    pub press: PressStats,
+    pub compress_stats: CompressStats,
     /// The level of now; 0: payloads go as they are.
     pub level: u8,
     /// Where it goes.
@@ -412,7 +413,7 @@ impl TopicPath {
             name: self.name.clone(),
             granted,
             published_hz: self.offered.rate(now).0,
-            press: self.press,
+            compress_stats: self.compress_stats,
             level: self.level(),
             lanes,
         })

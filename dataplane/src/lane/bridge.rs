@@ -7,11 +7,11 @@ use blaze_domain::{DropReason, Priority, Scope};
 
 use super::admit::Admitted;
 use super::allocation::LaneGates;
+use super::compress_stage::plain;
 use super::core::{DRAIN, LaneLink};
 use super::load::LoadMeter;
 use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
-use super::press::plain;
 use super::reading::For;
 use super::stats::BridgeStats;
 use super::succession::{Succession, Waiting};
@@ -41,7 +41,7 @@ impl BridgeState {
             allocated_hz: None,
             exceeds_advertised: false,
             sink,
-            pressing: 0,
+            in_codec: 0,
             submitted: false,
             held: None,
             unwritten: None,

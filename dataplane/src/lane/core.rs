@@ -21,12 +21,12 @@ use lru::LruCache;
 
 use super::admit::{Admitted, Refusal};
 use super::allocation::Reckoned;
+use super::compress_stage::{Arrival, CompressStage, ToLanes};
 use super::early::Early;
 use super::kept::KeptMessages;
 use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
-use super::press::{Arrival, Press, ToLanes};
 use super::reading::For;
 use super::stats::Drops;
 use super::succession::Succession;
@@ -136,7 +136,7 @@ pub struct DataCore {
     /// Of transient_local writers, for bridges that begin later.
     pub(super) kept: KeptMessages,
     /// Compression and decompression.
-    pub(super) press: Press,
+    pub(super) compress: CompressStage,
     /// Durable bridges that have just begun: topic and place.
     pub(super) begun: Vec<(TopicId, usize)>,
     /// What could not be attributed to a topic.
@@ -173,7 +173,7 @@ impl DataCore {
             early: Early::default(),
             succession: Succession::default(),
             kept: KeptMessages::default(),
-            press: Press::default(),
+            compress: CompressStage::default(),
             begun: Vec::new(),
             unattributed: Drops::default(),
             leaving: BTreeSet::new(),
@@ -313,7 +313,7 @@ impl DataCore {
         }
         let age_us = frame.age_us();
         let message = Admitted::new(now, frame, false, age_us, 0);
-        self.press_in(now, topic, message, link);
+        self.compress_in(now, topic, message, link);
     }
 
     /// Delivers what waited for the bridges of a topic: what is kept for late joiners, and what
@@ -457,7 +457,7 @@ impl DataCore {
             self.note_size(now, topic, bytes, link);
         }
         if !lanes.is_empty() {
-            self.press_out(now, topic, &message.frame, lanes, Arrival::Live, link);
+            self.compress_out(now, topic, &message.frame, lanes, Arrival::Live, link);
         }
     }
 }

@@ -31,7 +31,7 @@ pub(super) struct Early {
 impl Early {
     /// Holds a message. Returns those that gave way.
     pub(super) fn hold(&mut self, now: Instant, frame: Frame) -> Vec<Frame> {
-        self.bytes += frame.wire_len();
+        self.bytes += frame.received_len();
         match self.topics.get_mut(frame.topic()) {
             Some(count) => *count += 1,
             None => {
@@ -77,7 +77,7 @@ impl Early {
             .partition(|(_, frame)| frame.topic() == topic);
         self.waiting = left;
         let aged = taken.into_iter().map(|(since, frame)| {
-            self.bytes -= frame.wire_len();
+            self.bytes -= frame.received_len();
             let waited = micros(now.saturating_duration_since(since));
             let (hops, age_us) = (frame.hops(), frame.age_us().saturating_add(waited));
             frame.with_hops_and_age(hops, age_us)
@@ -87,7 +87,7 @@ impl Early {
 
     fn pop(&mut self) -> Option<Frame> {
         let (_, frame) = self.waiting.pop_front()?;
-        self.bytes -= frame.wire_len();
+        self.bytes -= frame.received_len();
         if let Some(count) = self.topics.get_mut(frame.topic()) {
             *count -= 1;
             if *count == 0 {

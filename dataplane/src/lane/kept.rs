@@ -91,7 +91,7 @@ impl KeptMessages {
             age_us: message.age_us,
             since: now,
         };
-        self.writers.keep(key, kept, message.frame.wire_len(), depth);
+        self.writers.keep(key, kept, message.frame.received_len(), depth);
     }
 
     /// A service has begun a new life: the writers of its earlier ones are no more.

@@ -115,7 +115,7 @@ impl BridgeState {
     /// Whether its lane is so far behind, or its peer so silent, that it could not be emptied in
     /// passing.
     fn is_behind(&mut self, now: Instant, link: &dyn LaneLink) -> bool {
-        let queued = self.lane_id().map_or(0, |lane| link.queued(lane)) + self.pressing;
+        let queued = self.lane_id().map_or(0, |lane| link.queued(lane)) + self.in_codec;
         let silent = self.receiver().is_some_and(|(_, peer)| link.is_suspect(peer));
         let in_passing = self.out_rate.rate(now).0 * BEHIND.as_secs_f64() + 1.0;
         queued > 0 && (silent || queued as f64 > in_passing)

@@ -3,6 +3,7 @@
 mod admit;
 pub mod allocation;
 mod bridge;
+pub mod compress_stage;
 pub mod core;
 mod early;
 pub mod kept;
@@ -10,7 +11,6 @@ pub mod load;
 pub mod measure;
 pub mod path;
 mod places;
-pub mod press;
 pub mod reading;
 pub mod stats;
 mod succession;

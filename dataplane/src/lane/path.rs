@@ -10,10 +10,10 @@ use blaze_proto::Frame;
 
 use super::admit::Refusal;
 use super::allocation::{Granted, LaneGates, Published, Told};
+use super::compress_stage::{CompressStats, TopicEffort};
 use super::core::FORGET;
 use super::load::LoadMeter;
 use super::measure::RateMeter;
-use super::press::{PressStats, TopicEffort};
 use super::reading::Places;
 use super::stats::{BridgeStats, Drops};
 use super::succession::{Held, Unwritten};
@@ -181,7 +181,7 @@ pub struct BridgeState {
     /// Where it writes.
     pub sink: Sink,
     /// Messages that are being compressed, or wait behind such.
-    pub(super) pressing: u64,
+    pub(super) in_codec: u64,
     /// It has given messages to its lane since it last ended.
     pub(super) submitted: bool,
     /// Messages that wait until the receiver before this one has written its own.
@@ -225,7 +225,7 @@ impl BridgeState {
             Sink::Publish { writer, past, .. } => writer.is_some() || !past.is_empty(),
             Sink::Lane { .. } => false,
         };
-        self.phase == Phase::Ended && !waits && self.pressing == 0
+        self.phase == Phase::Ended && !waits && self.in_codec == 0
     }
 
     /// Whether it ended so long ago that another bridge may have its place.
@@ -272,7 +272,7 @@ pub struct TopicPath {
     /// The level over time.
     pub effort: TopicEffort,
     /// What compression did.
-    pub press: PressStats,
+    pub compress_stats: CompressStats,
     /// Messages that are worth compressing and that some lane has admitted.
     pub(super) worth_rate: RateMeter,
     /// Largest payload as sent on the inter scope.
@@ -319,7 +319,7 @@ impl TopicPath {
             largest_bytes: 0,
             compression: Compression::default(),
             effort: TopicEffort::default(),
-            press: PressStats::default(),
+            compress_stats: CompressStats::default(),
             worth_rate: RateMeter::new(now),
             sent_size: SizeMeter::default(),
             sent_level: 0,

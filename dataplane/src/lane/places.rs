@@ -5,9 +5,9 @@ use std::time::Instant;
 
 use blaze_domain::{TopicName, WriterId};
 
+use super::compress_stage::{Arrival, ToLanes};
 use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
-use super::press::{Arrival, ToLanes};
 use super::succession::LONGEST_WAIT;
 use super::writer::NewWriter;
 use crate::link::LaneId;
@@ -21,7 +21,7 @@ impl DataCore {
         let before = self.vacant.len();
         for (index, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
             // What is with the codec comes back to its topic.
-            if !path.is_idle() || self.press.holds(topic_id(index)) {
+            if !path.is_idle() || self.compress.holds(topic_id(index)) {
                 path.idle = None;
                 continue;
             }
@@ -54,7 +54,7 @@ impl DataCore {
             return Some(*id);
         }
         let mut path = TopicPath::new(name.clone(), self.placed + 1, now);
-        path.compression = self.press.find(name);
+        path.compression = self.compress.find(name);
         let id = match self.vacant.pop() {
             Some(id) => {
                 self.topics[id.0 as usize] = path;
@@ -158,7 +158,7 @@ impl DataCore {
                 if passed_on.is_some() {
                     self.put_to_lanes(now, topic, lanes, link);
                 } else {
-                    self.press_out(now, topic, &frame, lanes, Arrival::Kept, link);
+                    self.compress_out(now, topic, &frame, lanes, Arrival::Kept, link);
                 }
             }
             let path = &mut self.topics[topic.0 as usize];

@@ -7,7 +7,7 @@
 
 use std::sync::Arc;
 
-use blaze_brokers::{Begin, Place};
+use blaze_brokers::{Begin, ConsumerOffset};
 use blaze_domain::Scope;
 
 use super::core::DataCore;
@@ -48,8 +48,8 @@ fn at(offsets: &[i64], partition: usize) -> i64 {
 
 impl Places {
     /// Takes note of a message that was read, and says whom it is for.
-    pub(super) fn take(&mut self, place: Option<Place>) -> For {
-        let Some(Place { partition, offset, .. }) = place else {
+    pub(super) fn take(&mut self, place: Option<ConsumerOffset>) -> For {
+        let Some(ConsumerOffset { partition, offset, .. }) = place else {
             return For::All;
         };
         // Kafka's partitions are few; a number beyond is none.
@@ -198,11 +198,11 @@ impl DataCore {
 mod tests {
     use super::*;
 
-    fn place_in(partition: usize, offset: i64) -> Option<Place> {
-        Some(Place { partition, offset, appended_ms: None })
+    fn place_in(partition: usize, offset: i64) -> Option<ConsumerOffset> {
+        Some(ConsumerOffset { partition, offset, appended_ms: None })
     }
 
-    fn place(offset: i64) -> Option<Place> {
+    fn place(offset: i64) -> Option<ConsumerOffset> {
         place_in(0, offset)
     }
 

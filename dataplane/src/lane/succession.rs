@@ -78,7 +78,7 @@ impl Waiting {
     }
 
     fn cost(&self) -> usize {
-        self.frame.wire_len() + OVERHEAD
+        self.frame.received_len() + OVERHEAD
     }
 }
 
@@ -135,7 +135,7 @@ impl Succession {
     /// on.
     pub(super) fn await_written(&mut self, now: Instant, topic: TopicId, bridge: &mut BridgeState) {
         // What is with the codec will be given to its lane.
-        let was_used = bridge.submitted || bridge.pressing > 0;
+        let was_used = bridge.submitted || bridge.in_codec > 0;
         if self.leaving || !was_used || bridge.unwritten.is_some() {
             return;
         }
@@ -245,7 +245,7 @@ impl BridgeState {
         let until = self.waits_for_answer(now, link).unwrap_or(until);
         let lane = self.lane_id();
         let queued = match lane {
-            Some(lane) => link.queued(lane) + self.pressing,
+            Some(lane) => link.queued(lane) + self.in_codec,
             None => self.settle(),
         };
         // What a bridge from the inter scope has to empty is on its way to it: it stays until the
@@ -324,7 +324,7 @@ impl BridgeState {
     fn has_room(&self, message: &Waiting, link: &dyn LaneLink) -> bool {
         match (&self.sink, &self.target) {
             (Sink::Lane { class, .. }, Target::Inter { receiver, .. }) => {
-                link.has_room(receiver, *class, message.frame.wire_len())
+                link.has_room(receiver, *class, message.frame.received_len())
             }
             _ => true,
         }
@@ -395,9 +395,9 @@ impl DataCore {
                 held.append(bridges[heir].held.take());
                 bridges[heir].held = Some(held);
                 // What of its messages is with the codec comes behind these.
-                let moved = self.press.hand_over(topic, at, heir);
-                bridges[at].pressing = bridges[at].pressing.saturating_sub(moved);
-                bridges[heir].pressing += moved;
+                let moved = self.compress.hand_over(topic, at, heir);
+                bridges[at].in_codec = bridges[at].in_codec.saturating_sub(moved);
+                bridges[heir].in_codec += moved;
                 if !bridges[at].submitted {
                     // Its receiver got nothing, and gets nothing any more.
                     bridges[at].unwritten = None;
@@ -465,7 +465,7 @@ impl DataCore {
 
     /// Whether something that came over the link waits for a broker.
     pub fn has_unwritten(&mut self) -> bool {
-        if self.press.delays_any() {
+        if self.compress.delays_any() {
             return true;
         }
         let bridges = self.topics.iter_mut().flat_map(|topic| &mut topic.bridges);
@@ -552,7 +552,7 @@ impl DataCore {
         let Some(topic) = self.find(&question.topic) else {
             return true;
         };
-        if self.press.delays(topic) {
+        if self.compress.delays(topic) {
             return false;
         }
         let bridges = &mut self.topics[topic.0 as usize].bridges;

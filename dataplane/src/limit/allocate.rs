@@ -1,6 +1,6 @@
-//! How a byte budget becomes rates (F9, client level): a pure function.
+//! How a byte budget becomes rates (`docs/design/bandwidth.md`): a pure function.
 //!
-//! Symbols, as in the paper and in the requirements:
+//! Symbols:
 //!
 //! | symbol | here | meaning |
 //! |---|---|---|
@@ -40,7 +40,7 @@ pub struct Terms {
 }
 
 impl Default for Terms {
-    /// As in the paper, with the threshold of the node file.
+    /// The defaults of the node file.
     fn default() -> Self {
         Self {
             overhead: 1.02,
@@ -55,7 +55,7 @@ impl Default for Terms {
 /// How large topics share what standard ones leave.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Sharing {
-    /// Largest demand first.
+    /// Largest demand first: the original algorithm.
     #[default]
     Paper,
     /// Max-min fairness in bytes per second, per topic.

@@ -1,4 +1,4 @@
-//! Token bucket of one lane (F9, publisher level).
+//! Token bucket of one lane (`docs/design/bandwidth.md`).
 
 use std::time::Instant;
 

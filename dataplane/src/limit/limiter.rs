@@ -36,8 +36,8 @@ const TOLD_EVERY: Duration = Duration::from_secs(10);
 pub enum LinkRate {
     /// Nothing is known to be less than its limit.
     Free,
-    /// It is being found out, and so much may be sent now: that thins large topics alone.
-    Passing(f64),
+    /// The estimate is still rising, and so much may be sent now: that thins large topics alone.
+    Ramping(f64),
     /// So much, as was seen.
     Carries(f64),
 }
@@ -141,14 +141,14 @@ impl Limiter {
             Some((layer.clone(), self.budget(limit, Some(layer), 1.0)))
         };
         let of_flow = |(flow, rate): (&FlowId, &LinkRate)| {
-            let (carries, passing) = match *rate {
+            let (carries, is_ramping) = match *rate {
                 LinkRate::Free => return None,
-                LinkRate::Passing(bytes_per_s) => (bytes_per_s, true),
+                LinkRate::Ramping(bytes_per_s) => (bytes_per_s, true),
                 LinkRate::Carries(bytes_per_s) => (bytes_per_s, false),
             };
             let bytes_per_s =
                 self.budget(carries, Some(&flow.layer), self.control_share(&flow.layer));
-            let budget = FlowBudget { bytes_per_s, passing };
+            let budget = FlowBudget { bytes_per_s, is_ramping };
             Some((flow.clone(), budget))
         };
         Budgets {
@@ -256,7 +256,7 @@ impl Limiter {
             for flow in flows {
                 match self.measured.get(flow) {
                     Some(LinkRate::Carries(bytes_per_s)) => *sum.get_or_insert(0.0) += *bytes_per_s,
-                    Some(LinkRate::Free | LinkRate::Passing(_)) | None => return None,
+                    Some(LinkRate::Free | LinkRate::Ramping(_)) | None => return None,
                 }
             }
         }
@@ -308,7 +308,8 @@ fn has_moved(before: &Budgets, after: &Budgets) -> bool {
     let of_flows = before.flows.len() != after.flows.len()
         || after.flows.iter().any(|(flow, after)| {
             let differs = |before: &FlowBudget| {
-                before.passing != after.passing || moved(before.bytes_per_s, after.bytes_per_s)
+                before.is_ramping != after.is_ramping
+                    || moved(before.bytes_per_s, after.bytes_per_s)
             };
             before.flows.get(flow).is_none_or(differs)
         });
@@ -489,7 +490,7 @@ mod tests {
         };
         assert_eq!(shown(LinkRate::Free), (None, Some(3e6), None, None));
         // A slow start has a rate, and has measured nothing.
-        assert_eq!(shown(LinkRate::Passing(1e5)), (None, Some(3e6), None, None));
+        assert_eq!(shown(LinkRate::Ramping(1e5)), (None, Some(3e6), None, None));
         assert_eq!(shown(LinkRate::Carries(1e5)), (Some(3.1e6), Some(3e6), Some(1e5), None));
     }
 
@@ -497,7 +498,7 @@ mod tests {
     fn a_link_that_rises_thins_what_is_large_and_is_no_fault() {
         let receivers = [flow("cloud/a")];
         let mut limiter = limiter(80.0, WireOverhead::Off);
-        look(&mut limiter, Instant::now(), &[("cloud/a", LinkRate::Passing(150_000.0))]);
+        look(&mut limiter, Instant::now(), &[("cloud/a", LinkRate::Ramping(150_000.0))]);
         let demands = [camera(&receivers), topic("odom", 1_000, &receivers)];
         let rates = limiter.run(Instant::now(), &demands);
         assert_eq!(rates.topics[1].lanes_hz, [100.0]);

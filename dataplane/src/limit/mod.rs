@@ -1,7 +1,7 @@
-//! How much may leave: rates per lane, and the budget of the wire.
+//! How much may leave: rates per lane, and the budget of the wire. See `docs/design/bandwidth.md`.
 //!
 //! ```text
-//! budgets, sizes, rates ─► allocate (F9) ─► rates ─► gate: whole messages, per lane ─► queues ─► pacer: wire bytes
+//! budgets, sizes, rates ─► allocate ─► rates ─► gate: whole messages, per lane ─► queues ─► pacer: wire bytes
 //! ```
 //!
 //! The allocation decides what is worth sending, in whole messages; the pacer keeps the limit,

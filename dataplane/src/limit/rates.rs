@@ -1,9 +1,9 @@
 //! What each lane of one flow runs at: the budget of the process, and the budgets of single links
-//! besides (F9). A link has a budget where the node file limits what goes to its layer, and where
-//! it was seen to carry less.
+//! besides. A link has a budget where the node file limits what goes to its layer, and where it was
+//! seen to carry less. Symbols: see [`allocate`](super::allocate).
 //!
-//! The same function serves the running flow and `blaze plan`, so that what was planned is what
-//! happens.
+//! `blaze plan` calls the allocator of a running flow, with the configured limits only: measured
+//! link capacity and wire overhead are not known there.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,7 +12,7 @@ use blaze_domain::{FlowId, LayerName};
 
 use super::allocate::{Class, Grant, Lane, Sharing, Terms, Topic, allocate};
 
-/// One copy of a topic: to one destination layer.
+/// One lane: one copy of a topic, to one receiver in `layer`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LaneDemand<'a> {
     /// Where it goes.
@@ -54,9 +54,9 @@ pub struct Budgets {
 pub struct FlowBudget {
     /// In bytes per second of `s · α`.
     pub bytes_per_s: f64,
-    /// It is not what the link carries, but a step on the way there: large topics are thinned to it
-    /// and standard ones are not, and nobody is told that it is too small.
-    pub passing: bool,
+    /// The estimate is still rising. Large topics are limited to it, standard ones are not, and the
+    /// link is not reported as infeasible.
+    pub is_ramping: bool,
 }
 
 /// What one topic gets.
@@ -64,7 +64,7 @@ pub struct FlowBudget {
 pub struct TopicRates {
     /// Whether it is large.
     pub class: Class,
-    /// `r_i` by the budget of the process, in Hz.
+    /// Rate that the flow's total budget allows, in Hz, before link budgets.
     pub rate_hz: f64,
     /// What each lane runs at, in the order in which they were given, in Hz.
     pub lanes_hz: Vec<f64>,
@@ -113,7 +113,7 @@ pub fn rates(budgets: &Budgets, terms: &Terms, demands: &[Demand<'_>]) -> Rates 
             lanes_hz: demands[at].lanes.iter().map(|lane| grant.lane_hz(&as_lane(lane))).collect(),
         })
         .collect();
-    let mut bound =
+    let mut cap_lanes =
         |budget: f64, spares_standard: bool, is_in: &dyn Fn(&LaneDemand<'_>) -> bool| -> bool {
             let (of_link, feasible) = within(budget, terms, demands, is_in);
             for (at, grant) in of_link {
@@ -130,14 +130,14 @@ pub fn rates(budgets: &Budgets, terms: &Terms, demands: &[Demand<'_>]) -> Rates 
         };
     let mut infeasible_links = BTreeSet::new();
     for (layer, budget) in &budgets.links {
-        if !bound(*budget, false, &|lane: &LaneDemand<'_>| lane.layer == layer) {
+        if !cap_lanes(*budget, false, &|lane: &LaneDemand<'_>| lane.layer == layer) {
             infeasible_links.insert(layer.clone());
         }
     }
     for (flow, budget) in &budgets.flows {
         let goes_there = |lane: &LaneDemand<'_>| lane.receiver == Some(flow);
-        let feasible = bound(budget.bytes_per_s, budget.passing, &goes_there);
-        if !feasible && !budget.passing {
+        let feasible = cap_lanes(budget.bytes_per_s, budget.is_ramping, &goes_there);
+        if !feasible && !budget.is_ramping {
             infeasible_links.insert(flow.layer.clone());
         }
     }
@@ -197,7 +197,7 @@ fn within(
     for (at, demand) in demands.iter().enumerate() {
         let lanes: Vec<Lane> =
             demand.lanes.iter().filter(|lane| is_in(lane)).map(as_lane).collect();
-        // One that goes nowhere costs nothing, and is granted what it says.
+        // A topic without lanes is kept so that its row exists; it costs nothing.
         if lanes.is_empty() && !demand.lanes.is_empty() {
             continue;
         }
@@ -291,10 +291,10 @@ mod tests {
             demand("stop", 1_000, 10.0, both()),
             demand("unasked", 1_000_000, 10.0, Vec::new()),
         ];
-        let slow = |bytes_per_s, passing| {
+        let slow = |bytes_per_s, is_ramping| {
             let budgets = Budgets {
                 process: 100e6,
-                flows: BTreeMap::from([(other.clone(), FlowBudget { bytes_per_s, passing })]),
+                flows: BTreeMap::from([(other.clone(), FlowBudget { bytes_per_s, is_ramping })]),
                 ..Budgets::default()
             };
             rates(&budgets, &Terms::default(), &demands)
@@ -329,7 +329,7 @@ mod tests {
             process: 100e6,
             flows: BTreeMap::from([(
                 robot.clone(),
-                FlowBudget { bytes_per_s: 100.0, passing: true },
+                FlowBudget { bytes_per_s: 100.0, is_ramping: true },
             )]),
             ..Budgets::default()
         };

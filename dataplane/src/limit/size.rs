@@ -1,9 +1,9 @@
-//! `s` of F9: the largest payload of a topic as it is sent.
+//! `s` of the allocation: the largest payload of a topic as it is sent.
 
 use std::time::{Duration, Instant};
 
-/// The largest size of late. It is remembered for ever, as in the paper, or for a while, so that
-/// one outlier does not lower the rate of its topic until the flow is started again.
+/// The largest recent size. It is remembered for ever or for a while (`size_window_s`), so that one
+/// outlier does not lower the rate of its topic until the flow is started again.
 #[derive(Debug, Clone, Default)]
 pub struct SizeMeter {
     /// Of the current window and the one before; without a window all is in the first.

@@ -1,4 +1,4 @@
-//! How much more the wire carries than `s · α`: the wire factor ω of F9, measured.
+//! How much more the wire carries than `s · α`: the measured wire factor ω.
 //!
 //! What leaves is user messages with their headers, chunks and repairs, and the link's own control
 //! messages. The first grows with what is sent, the second does not. So both are measured apart:

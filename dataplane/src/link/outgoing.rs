@@ -45,7 +45,7 @@ pub(crate) struct Outgoing {
 
 impl Outgoing {
     pub(crate) fn new(submit: Submit<'_>, part_bytes: usize) -> Self {
-        let count = submit.frame.wire_len().div_ceil(part_bytes).max(1);
+        let count = submit.frame.received_len().div_ceil(part_bytes).max(1);
         let age = Duration::from_micros(submit.frame.age_us());
         let deadline = submit
             .lifespan
@@ -68,7 +68,7 @@ impl Outgoing {
 
     /// Bytes of the frame, for queues and parts.
     pub(crate) fn bytes(&self) -> usize {
-        self.frame.wire_len()
+        self.frame.received_len()
     }
 
     /// Bytes of the payload, for whom it is counted.

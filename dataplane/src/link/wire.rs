@@ -350,7 +350,7 @@ mod tests {
     fn part(frame: &Frame, offset: usize, length: usize) -> Record {
         Record {
             message: 5,
-            total: u32::try_from(frame.wire_len()).unwrap(),
+            total: u32::try_from(frame.received_len()).unwrap(),
             offset: u32::try_from(offset).unwrap(),
             length: u32::try_from(length).unwrap(),
             hops: 2,

@@ -1,4 +1,4 @@
-//! From a control message to the lease that it makes, and to whoever holds it.
+//! From a control message to the lease that it makes, and to its holder.
 
 use std::time::{Duration, Instant};
 

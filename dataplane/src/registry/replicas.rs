@@ -1,9 +1,10 @@
 //! Flows of the own layer on the channel that they share on their layer broker, with or without an
 //! inter scope between them.
 //!
-//! A flow that was ever heard there lives as long as it is heard there: whoever has lost the broker
-//! cannot carry its topics, whatever the inter scope says, and what it says there is what counts,
-//! with or without a link. Deltas are broadcast, requests and snapshots name whom they are for.
+//! A flow that was ever heard there lives as long as it is heard there: one that has lost the
+//! broker cannot carry its topics, whatever the inter scope says, and what it says there is what
+//! counts, with or without a link. Deltas are broadcast, requests and snapshots name whom they are
+//! for.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};

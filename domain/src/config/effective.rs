@@ -28,9 +28,9 @@ pub struct Sources {
     service_name: Option<ServiceName>,
 }
 
-/// For whom, in names.
+/// Service, instance, layer and node whose effective configuration is asked for.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct At {
+pub struct ConfigTarget {
     /// Which service; `None`: layer and node alone.
     pub service: Option<ServiceName>,
     /// Which instance of it.
@@ -44,14 +44,14 @@ pub struct At {
 impl Sources {
     /// The documents that count at a place; a roll-out counts on its canary nodes.
     #[must_use]
-    pub fn at(state: &State, at: &At) -> Self {
+    pub fn at(state: &State, at: &ConfigTarget) -> Self {
         Self::at_where(state, at, |_| true)
     }
 
     /// The same with those roll-outs alone that `counts` lets pass: a worker undoes one that failed
     /// on its node before the main service knows.
     #[must_use]
-    pub fn at_where(state: &State, at: &At, counts: impl Fn(&Document) -> bool) -> Self {
+    pub fn at_where(state: &State, at: &ConfigTarget, counts: impl Fn(&Document) -> bool) -> Self {
         let document = |key: Key| state.get(&key).map(|held| Arc::clone(&held.document));
         let mut sources = Self {
             service: at.service.as_ref().and_then(|name| document(Key::service(name))),
@@ -72,9 +72,9 @@ impl Sources {
 
     /// Where an instance's own document places it.
     #[must_use]
-    pub fn placed(state: &State, service: &ServiceName, instance: &Document) -> At {
+    pub fn placed(state: &State, service: &ServiceName, instance: &Document) -> ConfigTarget {
         let placement = placement(state, instance);
-        At {
+        ConfigTarget {
             service: Some(service.clone()),
             instance: Some(instance.key.name().clone()),
             layer: placement.layer,

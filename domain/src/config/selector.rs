@@ -19,7 +19,7 @@ pub enum LabelError {
     #[error("has an empty name")]
     Empty,
     /// Name or value is too long.
-    #[error("is longer than {MAX_LABEL_BYTES}")]
+    #[error("is longer than {MAX_LABEL_BYTES} bytes")]
     TooLong,
     /// Name or value holds something else.
     #[error("may hold A-Z, a-z, 0-9, -, _ and ., and begins and ends with a letter or digit")]
@@ -81,7 +81,7 @@ pub(super) fn is_dns_name(text: &str) -> bool {
     text.len() <= MAX_PREFIX_BYTES && text.split('.').all(label)
 }
 
-/// Which labels: every requirement holds.
+/// A label selector; all requirements must hold.
 ///
 /// ```
 /// use blaze_domain::config::selector::LabelSelector;
@@ -96,11 +96,11 @@ pub struct LabelSelector(Vec<Requirement>);
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Requirement {
     key: String,
-    test: Test,
+    condition: Condition,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-enum Test {
+enum Condition {
     Is(String),
     IsNot(String),
     In(Vec<String>),
@@ -118,7 +118,7 @@ pub enum SelectorError {
     /// The text is too long.
     #[error("has {0} bytes, at most {MAX_SELECTOR_BYTES} are allowed")]
     TooLong(usize),
-    /// Something else is needed at a place.
+    /// Syntax error: `wanted` expected at character `at`.
     #[error("needs {wanted} at character {at}")]
     Form {
         /// What.
@@ -148,11 +148,11 @@ impl LabelSelector {
     /// Whether labels fulfil every requirement.
     #[must_use]
     pub fn matches(&self, labels: &Labels) -> bool {
-        self.0.iter().all(|requirement| requirement.test.holds(labels.get(&requirement.key)))
+        self.0.iter().all(|requirement| requirement.condition.holds(labels.get(&requirement.key)))
     }
 }
 
-impl Test {
+impl Condition {
     fn holds(&self, value: Option<&String>) -> bool {
         match self {
             Self::Is(wanted) => value == Some(wanted),
@@ -257,26 +257,26 @@ impl<'t> Cursor<'t> {
     fn requirement(&mut self) -> Result<Requirement, SelectorError> {
         if self.take("!") {
             let key = self.key()?;
-            return Ok(Requirement { key, test: Test::Absent });
+            return Ok(Requirement { key, condition: Condition::Absent });
         }
         let key = self.key()?;
-        let test = if self.take("!=") {
-            Test::IsNot(self.value()?)
+        let condition = if self.take("!=") {
+            Condition::IsNot(self.value()?)
         } else if self.take("==") || self.take("=") {
-            Test::Is(self.value()?)
+            Condition::Is(self.value()?)
         } else if self.is_at_end() || self.rest().starts_with(',') {
-            Test::Exists
+            Condition::Exists
         } else {
             match self.word() {
-                "in" => Test::In(self.set()?),
-                "notin" => Test::NotIn(self.set()?),
+                "in" => Condition::In(self.set()?),
+                "notin" => Condition::NotIn(self.set()?),
                 word => {
                     self.at -= word.len();
                     return Err(self.needs("=, ==, !=, in, notin, a comma or the end"));
                 }
             }
         };
-        Ok(Requirement { key, test })
+        Ok(Requirement { key, condition })
     }
 
     fn set(&mut self) -> Result<Vec<String>, SelectorError> {
@@ -300,17 +300,17 @@ impl<'t> Cursor<'t> {
 
 impl fmt::Display for LabelSelector {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (index, Requirement { key, test }) in self.0.iter().enumerate() {
+        for (index, Requirement { key, condition }) in self.0.iter().enumerate() {
             if index > 0 {
                 f.write_str(",")?;
             }
-            match test {
-                Test::Is(value) => write!(f, "{key}={value}")?,
-                Test::IsNot(value) => write!(f, "{key}!={value}")?,
-                Test::In(values) => write!(f, "{key} in ({})", values.join(","))?,
-                Test::NotIn(values) => write!(f, "{key} notin ({})", values.join(","))?,
-                Test::Exists => write!(f, "{key}")?,
-                Test::Absent => write!(f, "!{key}")?,
+            match condition {
+                Condition::Is(value) => write!(f, "{key}={value}")?,
+                Condition::IsNot(value) => write!(f, "{key}!={value}")?,
+                Condition::In(values) => write!(f, "{key} in ({})", values.join(","))?,
+                Condition::NotIn(values) => write!(f, "{key} notin ({})", values.join(","))?,
+                Condition::Exists => write!(f, "{key}")?,
+                Condition::Absent => write!(f, "!{key}")?,
             }
         }
         Ok(())

@@ -78,7 +78,10 @@ fn what_is_no_selector_is_refused() {
     }
     let long = format!("a={}", "b".repeat(64));
     assert!(
-        long.parse::<LabelSelector>().unwrap_err().to_string().ends_with("which is longer than 63")
+        long.parse::<LabelSelector>()
+            .unwrap_err()
+            .to_string()
+            .ends_with("which is longer than 63 bytes")
     );
     let huge = "a,".repeat(MAX_SELECTOR_BYTES);
     assert_eq!(huge.parse::<LabelSelector>(), Err(SelectorError::TooLong(2 * MAX_SELECTOR_BYTES)));

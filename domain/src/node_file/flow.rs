@@ -114,8 +114,7 @@ impl BandwidthSection {
         }
     }
 
-    /// The budget of all links together: `B_avail = L_client · 1024² / 8`, in bytes per second
-    /// (F9).
+    /// The budget of all links together, in bytes per second (`docs/design/bandwidth.md`).
     #[must_use]
     pub fn limit_bytes_per_s(&self) -> f64 {
         self.limit_mbps * BYTES_PER_MBIT
@@ -150,7 +149,7 @@ fn links(node: &Node<'_>) -> Option<BTreeMap<LayerName, LinkLimit>> {
 word_enum!(
     /// How the budget is divided among large topics.
     SharePolicy {
-        /// In the order of the paper.
+        /// Largest demand first (the original algorithm).
         Paper = "paper",
         /// By max-min fairness in bytes per second.
         Fair = "fair",

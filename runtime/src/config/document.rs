@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde_json::{Map, Value};
 
 use super::overlay::{self, Overlay};
-use super::place::{LocatedFault, Place, Places, join};
+use super::value_origin::{LocatedFault, Places, ValueOrigin, join};
 use super::yaml::{self, MAX_DEPTH, Origin};
 use crate::environment;
 
@@ -92,7 +92,7 @@ impl Sources {
             let looked =
                 self.search.iter().map(|file| file.display().to_string()).collect::<Vec<_>>();
             return Err(LocatedFault {
-                place: Place::Nowhere,
+                place: ValueOrigin::Nowhere,
                 path: String::new(),
                 detail: format!(
                     "no file: give --config FILE or BLAZE_CONFIG, or make one of {}",
@@ -104,7 +104,7 @@ impl Sources {
         match read_bounded(&file) {
             Ok(text) => Ok(Some((name, Arc::from(text)))),
             Err(detail) => Err(LocatedFault {
-                place: Place::File { file: name, line: 0 },
+                place: ValueOrigin::File { file: name, line: 0 },
                 path: String::new(),
                 detail,
             }),
@@ -185,7 +185,7 @@ impl Document {
     ) -> (Option<Self>, Vec<LocatedFault>) {
         let parsed = match &text {
             Some((name, text)) => yaml::parse(text, &Origin::File(Arc::clone(name)), ""),
-            None => yaml::parse("", &Origin::Single(Place::Nowhere), ""),
+            None => yaml::parse("", &Origin::Single(ValueOrigin::Nowhere), ""),
         };
         let whole = parsed.value.is_some();
         let mut faults = parsed.faults;
@@ -225,7 +225,7 @@ impl Document {
 
     /// Where a value comes from; for one that is missing, where its nearest ancestor does.
     #[must_use]
-    pub fn locate(&self, path: &str) -> Place {
+    pub fn locate(&self, path: &str) -> ValueOrigin {
         self.places.locate(path)
     }
 
@@ -237,7 +237,12 @@ impl Document {
     }
 
     /// Puts the YAML text of an override at its path, in place of what stands there.
-    fn put(&mut self, path: &str, place: &Place, text: &str) -> Result<(), Vec<LocatedFault>> {
+    fn put(
+        &mut self,
+        path: &str,
+        place: &ValueOrigin,
+        text: &str,
+    ) -> Result<(), Vec<LocatedFault>> {
         let steps = steps(path);
         let faulty = |path: &str, detail: String| {
             vec![LocatedFault { place: place.clone(), path: path.to_owned(), detail }]
@@ -278,8 +283,8 @@ impl Document {
 fn overrides<'s>(
     sources: &'s Sources,
     faults: &mut Vec<LocatedFault>,
-) -> Vec<(String, Place, &'s str)> {
-    let mut refuse = |place: &Place, detail: &str| {
+) -> Vec<(String, ValueOrigin, &'s str)> {
+    let mut refuse = |place: &ValueOrigin, detail: &str| {
         faults.push(LocatedFault {
             place: place.clone(),
             path: String::new(),
@@ -288,7 +293,7 @@ fn overrides<'s>(
     };
     let mut out = Vec::new();
     for (name, value) in &sources.environment {
-        let place = Place::Environment(Arc::from(name.as_str()));
+        let place = ValueOrigin::Environment(Arc::from(name.as_str()));
         let path =
             name.strip_prefix(PREFIX).unwrap_or(name).to_ascii_lowercase().replace("__", ".");
         if well_formed(&path) {
@@ -299,7 +304,7 @@ fn overrides<'s>(
     }
     out.sort_by_key(|(path, ..)| path.split('.').count());
     for (path, value) in &sources.overrides {
-        let place = Place::Override(Arc::from(path.as_str()));
+        let place = ValueOrigin::Override(Arc::from(path.as_str()));
         if well_formed(path) {
             out.push((path.clone(), place, value.as_str()));
         } else {

@@ -4,7 +4,7 @@
 //! ```text
 //! Current ─▶ good and new ─▶ the program ─▶ is anything left for a restart? ─┬─▶ `/readyz`, check `config`
 //!         └▶ faulty ─────────────────────────────────────────────────────────┼─▶ the log, each fault once
-//!                                                                            └─▶ whoever gave the overlay
+//!                                                                            └─▶ the source of the overlay
 //! ```
 
 use std::sync::Arc;
@@ -12,8 +12,8 @@ use std::sync::Arc;
 use serde_json::Value;
 use tokio::sync::watch;
 
-use super::place::join;
-use super::{Current, Loaded, LocatedFault, Place, Verdict};
+use super::value_origin::join;
+use super::{Current, Loaded, LocatedFault, ValueOrigin, Verdict};
 use crate::admin::{CheckStatus, Readiness};
 
 /// Keys that are named at a time, at most.
@@ -98,7 +98,7 @@ impl<T> Follower<T> {
         let below = |path: &str, keys: &[&str]| keys.iter().any(|key| is_at_or_below(path, key));
         paths.retain(|path| below(path, self.keys.read) && !below(path, self.keys.live));
         let origin_of = |path: &String| match now.document.locate(path) {
-            place @ Place::Overlay { .. } => Some(place),
+            place @ ValueOrigin::Overlay { .. } => Some(place),
             _ => None,
         };
         let (laid_over, of_file): (Vec<String>, Vec<String>) =

@@ -18,10 +18,10 @@ mod compose_tests;
 mod document;
 mod follow;
 mod overlay;
-mod place;
 mod scalar;
 #[cfg(test)]
 mod tests;
+mod value_origin;
 mod watch;
 mod yaml;
 #[cfg(test)]
@@ -34,7 +34,7 @@ use serde_json::Value;
 pub use document::{Document, MAX_FILE_BYTES, NamedText, Sources, parse_override};
 pub use follow::{Follower, Keys, follow};
 pub use overlay::{Overlay, Verdict};
-pub use place::{LocatedFault, Place};
+pub use value_origin::{LocatedFault, ValueOrigin};
 pub use watch::{Current, WatchSettings, watch, watch_with};
 pub use yaml::{located_documents, yaml_documents};
 

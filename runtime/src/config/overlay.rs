@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value};
 
-use super::place::{LocatedFault, Place, Places, join};
+use super::value_origin::{LocatedFault, Places, ValueOrigin, join};
 
 /// A tree that counts over the file and below environment and options.
 #[derive(Clone, PartialEq)]
@@ -42,17 +42,17 @@ pub struct Verdict {
 }
 
 impl Overlay {
-    pub(super) fn place(&self) -> Place {
-        Place::Overlay { origin: Arc::clone(&self.origin), revision: self.revision }
+    pub(super) fn place(&self) -> ValueOrigin {
+        ValueOrigin::Overlay { origin: Arc::clone(&self.origin), revision: self.revision }
     }
 }
 
 /// Merges a tree over another one; what it says has its place from then on.
-pub(super) fn merge(slot: &mut Value, places: &mut Places, patch: &Value, place: &Place) {
+pub(super) fn merge(slot: &mut Value, places: &mut Places, patch: &Value, place: &ValueOrigin) {
     merge_at(slot, places, patch, place, "");
 }
 
-fn merge_at(slot: &mut Value, places: &mut Places, patch: &Value, place: &Place, at: &str) {
+fn merge_at(slot: &mut Value, places: &mut Places, patch: &Value, place: &ValueOrigin, at: &str) {
     let Value::Object(members) = patch else {
         *slot = patch.clone();
         places.forget_below(at);
@@ -85,7 +85,7 @@ mod tests {
 
     #[test]
     fn an_overlay_is_a_merge_patch_and_what_it_says_has_its_place() {
-        let file = |line| Place::File { file: Arc::from("a.yaml"), line };
+        let file = |line| ValueOrigin::File { file: Arc::from("a.yaml"), line };
         let mut value = json!({
             "flow": {
                 "bandwidth": { "limit_mbps": 1, "overhead": 2 },

@@ -63,11 +63,11 @@ pub struct Current<T> {
     pub started: Arc<Loaded<T>>,
     /// The last one without faults.
     pub loaded: Arc<Loaded<T>>,
-    /// Why what the file says now does not hold; `None`: it does.
+    /// Faults of the present file content, if it was refused.
     pub faults: Option<Arc<[LocatedFault]>>,
     /// What became of the overlay; `None`: there is none.
     pub overlay: Option<Verdict>,
-    /// Counts the readings that were told, from 0 for the first.
+    /// Number of published readings; the first is 0.
     pub serial: u64,
 }
 
@@ -98,9 +98,9 @@ pub fn watch<T: Send + Sync + 'static>(
     watch_with(supervisor, sources, schema, initial, settings, nothing)
 }
 
-/// As [`watch`], with a tree over the file that changes while the program runs. A change of either
-/// is told once. What one of them says wrongly changes nothing and keeps the other from nothing;
-/// where both are good apart and faulty together, the later one does not count.
+/// As [`watch`], with an overlay (values from BlazeConfig) over the file. A faulty file or overlay
+/// is ignored, and the other still takes effect. If each is valid alone but the combination is not,
+/// the one that changed last is ignored.
 #[must_use]
 pub fn watch_with<T: Send + Sync + 'static>(
     supervisor: &Supervisor,

@@ -15,8 +15,8 @@ use std::sync::Arc;
 use saphyr_parser::{Event, Parser, ScalarStyle, Span, Tag};
 use serde_json::{Map, Value};
 
-use super::place::{LocatedFault, Place, Places, TOO_MANY_DOCUMENTS, join};
 use super::scalar::core_schema;
+use super::value_origin::{LocatedFault, Places, TOO_MANY_DOCUMENTS, ValueOrigin, join};
 
 /// Deepest nesting.
 pub(super) const MAX_DEPTH: usize = 32;
@@ -39,17 +39,17 @@ pub(super) enum Origin {
     /// Each line has its own place.
     File(Arc<str>),
     /// One place for all: a variable or an option.
-    Single(Place),
+    Single(ValueOrigin),
     /// Each line has its own place, of a text that is no file.
     Text,
 }
 
 impl Origin {
-    pub(super) fn place(&self, line: usize) -> Place {
+    pub(super) fn place(&self, line: usize) -> ValueOrigin {
         match self {
-            Self::File(file) => Place::File { file: Arc::clone(file), line },
+            Self::File(file) => ValueOrigin::File { file: Arc::clone(file), line },
             Self::Single(place) => place.clone(),
-            Self::Text => Place::Line(line),
+            Self::Text => ValueOrigin::Line(line),
         }
     }
 }

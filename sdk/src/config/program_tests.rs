@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_brokers::memory::MemoryHub;
-use blaze_runtime::config::{LocatedFault, Overlay, Place, Verdict};
+use blaze_runtime::config::{LocatedFault, Overlay, ValueOrigin, Verdict};
 use serde_json::json;
 
 use super::tests::{LONG, PlayedWorker, next, slam};
@@ -44,7 +44,7 @@ async fn sections_of_the_node_file_are_laid_over_and_judgements_acknowledged() {
     worker.tell(6, &json!({ "flow": { "pool_threads": "x" } }), "layer");
     let second = overlay(&service, &program, 6).await;
     let fault = LocatedFault {
-        place: Place::Overlay { origin: Arc::clone(&second.origin), revision: 6 },
+        place: ValueOrigin::Overlay { origin: Arc::clone(&second.origin), revision: 6 },
         path: "flow.pool_threads".to_owned(),
         detail: "expected a number".to_owned(),
     };

@@ -1,5 +1,5 @@
 //! The whole system: two robots, a fog with two flows over one Kafka, a cloud with another, and
-//! links between the layers like those of the paper's testbed.
+//! links between the layers like those of a robot laboratory.
 
 use std::time::Duration;
 

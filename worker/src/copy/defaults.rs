@@ -25,7 +25,7 @@ use blaze_domain::config::state::State;
 use blaze_domain::config::{
     Code, Document, FieldFault, Key, Kind, MAX_DOCUMENT_BYTES, MAX_DOCUMENTS, Timestamp, spec,
 };
-use blaze_runtime::config::{Place, yaml_documents};
+use blaze_runtime::config::{ValueOrigin, yaml_documents};
 use blaze_runtime::{Supervisor, TaskPolicy};
 use serde_json::Value;
 use tokio::sync::watch;
@@ -96,11 +96,12 @@ pub fn read(path: &Path, layer: &LayerName) -> Result<Defaults, DefaultsError> {
 /// Every fault, a hundred at most.
 fn parse(text: &str, name: &str) -> Result<BTreeMap<Key, Document>, DefaultsError> {
     let values = yaml_documents(text, MAX_DOCUMENTS).map_err(|faults| {
-        let place = |place: &Place| match place {
-            Place::Line(line) | Place::File { line, .. } => format!("{name}:{line}"),
-            Place::Nowhere | Place::Overlay { .. } | Place::Environment(_) | Place::Override(_) => {
-                name.to_owned()
-            }
+        let place = |place: &ValueOrigin| match place {
+            ValueOrigin::Line(line) | ValueOrigin::File { line, .. } => format!("{name}:{line}"),
+            ValueOrigin::Nowhere
+            | ValueOrigin::Overlay { .. }
+            | ValueOrigin::Environment(_)
+            | ValueOrigin::Override(_) => name.to_owned(),
         };
         let told = faults.iter().take(MAX_FAULTS).map(|fault| {
             let path =

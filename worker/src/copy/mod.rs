@@ -2,9 +2,9 @@
 //! configured.
 //!
 //! ```text
-//!                      ┌─[newest state, coalesced]─▶ writer ──▶ FileCopy
-//! Replica ──▶ Copies ──┤
-//!                      └─[newest state, coalesced]─▶ writer ──▶ MongoCopy     (where the node file has `database.mongodb`)
+//!                        ┌─[newest state, coalesced]─▶ writer ──▶ FileCopy
+//! LayerView ──▶ Copies ──┤
+//!                        └─[newest state, coalesced]─▶ writer ──▶ MongoCopy     (where the node file has `database.mongodb`)
 //!
 //! at the start:  the newer of both ([`choose`]), else the mounted file ([`defaults`])
 //! later:         a copy that could not be read at the start ──[Found]──▶ engine, before anything is written there

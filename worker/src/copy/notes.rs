@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::core::Place;
+use crate::core::ServedTarget;
 
 /// What must survive besides documents.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -10,9 +10,9 @@ pub struct Notes {
     /// Roll-outs that failed here, by `uid`, oldest first.
     pub failed: Vec<String>,
     /// Places that are notified of changes.
-    pub places: Vec<Place>,
+    pub places: Vec<ServedTarget>,
     /// Places whose last notice the broker still keeps.
-    pub ended: Vec<Place>,
+    pub ended: Vec<ServedTarget>,
     /// No place is notified with a lower revision.
     pub floor: u64,
 }

@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::{Loaded, Notes, Position};
-use crate::core::Place;
+use crate::core::ServedTarget;
 
 /// A document of any kind.
 pub(super) fn document(key: &str, revision: u64, spec: Value) -> Document {
@@ -51,7 +51,7 @@ pub(super) fn loaded(revision: u64, documents: impl IntoIterator<Item = Document
 pub(super) fn notes(uid: &str, floor: u64) -> Notes {
     Notes {
         failed: vec![uid.to_owned()],
-        places: vec![Place {
+        places: vec![ServedTarget {
             service: "slam".parse().unwrap(),
             instance: Some("0".parse().unwrap()),
             node: None,
@@ -145,7 +145,7 @@ pub(super) fn any_documents() -> impl Strategy<Value = Vec<Arc<Document>>> {
 /// Any notes.
 pub(super) fn any_notes() -> impl Strategy<Value = Notes> {
     let name = || prop::option::of("[a-c]{1,2}");
-    let place = ("[a-c]{1,2}", name(), name()).prop_map(|(service, instance, node)| Place {
+    let place = ("[a-c]{1,2}", name(), name()).prop_map(|(service, instance, node)| ServedTarget {
         service: service.parse().unwrap(),
         instance: instance.map(|name| name.parse().unwrap()),
         node: node.map(|name| name.parse().unwrap()),

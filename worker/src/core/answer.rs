@@ -2,15 +2,15 @@
 
 use std::time::Instant;
 
-use blaze_domain::config::effective::At;
+use blaze_domain::config::effective::ConfigTarget;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Kind, Timestamp};
 use blaze_domain::{DocumentName, NodeName, ServiceName};
 
 use super::messages::{ErrorCode, GetRequest, RequestError};
 use super::notice::Standing;
-use super::place::{Place, Source};
 use super::served::Served;
+use super::served_target::{ServedTarget, Source};
 
 /// Names that are compared with one that does not exist, at most.
 const MAX_COMPARED: usize = 1_000;
@@ -72,14 +72,14 @@ fn standing(
         return Err(RequestError::new(ErrorCode::NotReady, detail));
     }
     let Some(service) = &request.service else {
-        return Ok(served.standing_at(At {
+        return Ok(served.standing_at(ConfigTarget {
             service: None,
             instance: None,
             layer: Some(served.site().layer.clone()),
             node,
         }));
     };
-    let place = Place { service: service.clone(), instance: request.instance.clone(), node };
+    let place = ServedTarget { service: service.clone(), instance: request.instance.clone(), node };
     match served.ask(&place, now) {
         Some(standing) => Ok(standing),
         None => {

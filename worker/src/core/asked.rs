@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use lru::LruCache;
 
-use super::place::Place;
+use super::served_target::ServedTarget;
 
 /// How long who asked is told of changes. A service asks again every 60 s.
 pub const ASKED_FOR: Duration = Duration::from_secs(180);
@@ -12,7 +12,7 @@ pub const ASKED_FOR: Duration = Duration::from_secs(180);
 pub const MAX_ASKED: usize = 10_000;
 
 /// Places in the order in which they asked last, with the time.
-pub(super) struct Asked(LruCache<Place, Instant>);
+pub(super) struct Asked(LruCache<ServedTarget, Instant>);
 
 impl Default for Asked {
     /// The bound is kept here: a cache with one reserves room for all.
@@ -22,12 +22,12 @@ impl Default for Asked {
 }
 
 impl Asked {
-    pub(super) fn contains(&self, place: &Place) -> bool {
+    pub(super) fn contains(&self, place: &ServedTarget) -> bool {
         self.0.contains(place)
     }
 
     /// Notes that a place asked. Gives the one that had to go for it.
-    pub(super) fn touch(&mut self, place: &Place, now: Instant) -> Option<Place> {
+    pub(super) fn touch(&mut self, place: &ServedTarget, now: Instant) -> Option<ServedTarget> {
         self.0.put(place.clone(), now);
         if self.0.len() <= MAX_ASKED {
             return None;
@@ -36,7 +36,7 @@ impl Asked {
     }
 
     /// Takes out those whose time is over.
-    pub(super) fn expire(&mut self, now: Instant) -> Vec<Place> {
+    pub(super) fn expire(&mut self, now: Instant) -> Vec<ServedTarget> {
         let mut out = Vec::new();
         let is_over = |asked: &Instant| now.saturating_duration_since(*asked) > ASKED_FOR;
         while self.0.peek_lru().is_some_and(|(_, asked)| is_over(asked)) {
@@ -50,8 +50,8 @@ impl Asked {
 mod tests {
     use super::*;
 
-    fn place(instance: usize) -> Place {
-        Place {
+    fn place(instance: usize) -> ServedTarget {
+        ServedTarget {
             service: "slam".parse().unwrap(),
             instance: Some(instance.to_string().parse().unwrap()),
             node: None,

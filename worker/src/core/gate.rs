@@ -7,7 +7,7 @@
 //!                            open, for as long as the gate says ──▶ applied
 //!                              │ Complaint of a place that it changed, within the window
 //!                              ▼
-//!                   more than max_unhealthy ──▶ failed: undone here, whoever else is there or not
+//!                   more than max_unhealthy ──▶ failed: undone here, with or without the main service
 //! ```
 //!
 //! A window begins when the changed configuration was told here, by whomever; in a new life of the
@@ -19,8 +19,8 @@ use std::time::{Duration, Instant};
 use blaze_domain::{DocumentName, NodeName};
 
 use super::health::{Complaint, Trouble};
-use super::place::Place;
 use super::served::{Served, Trial};
+use super::served_target::ServedTarget;
 
 /// Roll-outs times canary nodes that are watched, at most; beyond, canaries are served and not
 /// judged, and counted.
@@ -88,7 +88,7 @@ struct Window {
     until: Option<Instant>,
     max_unhealthy: u64,
     /// What was said against it, by place.
-    troubled: BTreeMap<Place, String>,
+    troubled: BTreeMap<ServedTarget, String>,
     phase: RolloutPhase,
     reason: String,
 }

@@ -3,7 +3,7 @@ use std::time::Duration;
 use blaze_domain::config::Document;
 use serde_json::{Value, json};
 
-use super::super::place::Source;
+use super::super::served_target::Source;
 use super::super::testing::{document, labelled, place, site, state};
 use super::*;
 

@@ -16,7 +16,7 @@ use blaze_domain::NodeName;
 use blaze_domain::config::AckStatus;
 
 use super::messages::{ConfigAck, DEFAULT_TTL_MS, Health, ServiceState, WatchdogKey};
-use super::place::{Place, Site};
+use super::served_target::{ServedTarget, Site};
 
 /// Instances that are known, at most; more are counted and not known.
 pub const MAX_SIGNS: usize = 10_000;
@@ -43,7 +43,7 @@ pub enum Trouble {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Complaint {
     /// Whose configuration.
-    pub place: Place,
+    pub place: ServedTarget,
     /// What.
     pub trouble: Trouble,
     /// Which configuration, if that is said.
@@ -123,7 +123,7 @@ impl Signs {
             AckStatus::Unhealthy => Trouble::Unhealthy,
         };
         Some(Complaint {
-            place: Place { service: ack.service, instance: ack.instance, node },
+            place: ServedTarget { service: ack.service, instance: ack.instance, node },
             trouble,
             hash: ack.hash,
             revision: ack.revision,
@@ -276,7 +276,7 @@ impl Signs {
 
     /// How the instance of a place is.
     #[must_use]
-    pub fn of(&self, place: &Place) -> Option<&Row> {
+    pub fn of(&self, place: &ServedTarget) -> Option<&Row> {
         let key = WatchdogKey {
             service: place.service.clone(),
             node: place.node.clone()?,
@@ -305,7 +305,11 @@ impl Signs {
 
 fn lost(key: WatchdogKey) -> Complaint {
     Complaint {
-        place: Place { service: key.service, instance: Some(key.instance), node: Some(key.node) },
+        place: ServedTarget {
+            service: key.service,
+            instance: Some(key.instance),
+            node: Some(key.node),
+        },
         trouble: Trouble::Lost,
         hash: None,
         revision: None,

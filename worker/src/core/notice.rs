@@ -5,12 +5,12 @@ use std::sync::Arc;
 
 pub use blaze_domain::config::ConfigScope as Scope;
 use blaze_domain::config::diff::{self, diff};
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::{Document, json, secret};
 use blaze_domain::{DocumentName, LayerName};
 use serde_json::{Map, Value};
 
-use super::place::{Place, Source};
+use super::served_target::{ServedTarget, Source};
 
 /// Leaves that a notice names, at most. Beyond, whole objects are named instead.
 const MAX_LEAVES: usize = 1_000;
@@ -44,7 +44,7 @@ impl Config {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Standing {
     /// Whose it is.
-    pub at: At,
+    pub at: ConfigTarget,
     /// Where the store stood when it became what it is.
     pub revision: u64,
     /// Over it.
@@ -61,7 +61,7 @@ pub struct Standing {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Notice {
     /// Whose it is.
-    pub place: Place,
+    pub place: ServedTarget,
     /// The layer in which it counts.
     pub layer: LayerName,
     /// Where the store stood when it changed; never goes down for a place, and may be the same for
@@ -90,7 +90,7 @@ impl Notice {
     pub fn standing(&self) -> Option<Standing> {
         let (hash, config) = (self.hash.clone()?, self.config.clone()?);
         Some(Standing {
-            at: At {
+            at: ConfigTarget {
                 service: Some(self.place.service.clone()),
                 instance: self.place.instance.as_ref().map(DocumentName::from),
                 layer: Some(self.layer.clone()),

@@ -135,10 +135,10 @@ struct Run {
     truth: State,
     now: Instant,
     /// What each place knows: the hash, or that its service is deleted.
-    known: BTreeMap<Place, Option<String>>,
+    known: BTreeMap<ServedTarget, Option<String>>,
     /// Highest revision that each place was told, ever.
-    revisions: BTreeMap<Place, u64>,
-    asked: BTreeSet<Place>,
+    revisions: BTreeMap<ServedTarget, u64>,
+    asked: BTreeSet<ServedTarget>,
 }
 
 impl Run {
@@ -216,7 +216,7 @@ impl Run {
         }
     }
 
-    fn told(&mut self, place: &Place, revision: u64) {
+    fn told(&mut self, place: &ServedTarget, revision: u64) {
         let before = self.revisions.insert(place.clone(), revision);
         assert!(before.is_none_or(|before| before <= revision), "{place} goes back");
     }
@@ -262,15 +262,16 @@ impl Run {
         }
         let site = self.served.site();
         let homes = self.truth.all().filter_map(|(_, held)| site.home(&self.truth, &held.document));
-        let expected: BTreeSet<Place> = homes.chain(self.asked.iter().cloned()).collect();
-        let told: BTreeSet<Place> = self.served.told().map(|(place, _)| place.clone()).collect();
+        let expected: BTreeSet<ServedTarget> = homes.chain(self.asked.iter().cloned()).collect();
+        let told: BTreeSet<ServedTarget> =
+            self.served.told().map(|(place, _)| place.clone()).collect();
         assert_eq!(told, expected);
         assert_eq!(self.known.keys().cloned().collect::<BTreeSet<_>>(), expected);
     }
 }
 
 /// The hash of a place, worked out anew from all documents.
-fn fresh(served: &Served, truth: &State, place: &Place) -> Option<String> {
+fn fresh(served: &Served, truth: &State, place: &ServedTarget) -> Option<String> {
     truth.get(&Key::service(&place.service))?;
     let failed = served.failed();
     let sources = Sources::at_where(truth, &place.at(served.site()), |rollout| {

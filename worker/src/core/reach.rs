@@ -18,24 +18,24 @@ use blaze_domain::{InstanceName, NodeName, ServiceName};
 use serde_json::Value;
 
 use super::notice::said;
-use super::place::{Place, Site};
+use super::served_target::{ServedTarget, Site};
 use super::told::Told;
 
 /// The places that are told of changes, with what each was told last.
 #[derive(Default)]
 pub(super) struct Places {
-    told: BTreeMap<Place, Told>,
-    by_node: BTreeMap<NodeName, BTreeSet<Place>>,
+    told: BTreeMap<ServedTarget, Told>,
+    by_node: BTreeMap<NodeName, BTreeSet<ServedTarget>>,
     /// How often a place came or went.
     version: u64,
 }
 
 impl Places {
-    pub(super) fn get(&self, place: &Place) -> Option<&Told> {
+    pub(super) fn get(&self, place: &ServedTarget) -> Option<&Told> {
         self.told.get(place)
     }
 
-    pub(super) fn insert(&mut self, place: Place, told: Told) {
+    pub(super) fn insert(&mut self, place: ServedTarget, told: Told) {
         let is_new = !self.told.contains_key(&place);
         if let Some(node) = place.node.as_ref().filter(|_| is_new) {
             self.by_node.entry(node.clone()).or_default().insert(place.clone());
@@ -50,7 +50,7 @@ impl Places {
     }
 
     /// Whether it was there.
-    pub(super) fn remove(&mut self, place: &Place) -> bool {
+    pub(super) fn remove(&mut self, place: &ServedTarget) -> bool {
         let was_there = self.told.remove(place).is_some();
         self.version += u64::from(was_there);
         if let Some(node) = &place.node
@@ -64,15 +64,15 @@ impl Places {
         was_there
     }
 
-    pub(super) fn all(&self) -> impl Iterator<Item = (&Place, &Told)> {
+    pub(super) fn all(&self) -> impl Iterator<Item = (&ServedTarget, &Told)> {
         self.told.iter()
     }
 
     pub(super) fn of_service<'p>(
         &'p self,
         service: &'p ServiceName,
-    ) -> impl Iterator<Item = &'p Place> {
-        let range = self.told.range(Place::first_of(service, None)..);
+    ) -> impl Iterator<Item = &'p ServedTarget> {
+        let range = self.told.range(ServedTarget::first_of(service, None)..);
         range.map(|(place, _)| place).take_while(move |place| place.service == *service)
     }
 
@@ -80,14 +80,14 @@ impl Places {
         &'p self,
         service: &'p ServiceName,
         instance: &'p InstanceName,
-    ) -> impl Iterator<Item = &'p Place> {
-        let range = self.told.range(Place::first_of(service, Some(instance))..);
+    ) -> impl Iterator<Item = &'p ServedTarget> {
+        let range = self.told.range(ServedTarget::first_of(service, Some(instance))..);
         range.map(|(place, _)| place).take_while(move |place| {
             place.service == *service && place.instance.as_ref() == Some(instance)
         })
     }
 
-    pub(super) fn on_node(&self, node: &NodeName) -> impl Iterator<Item = &Place> {
+    pub(super) fn on_node(&self, node: &NodeName) -> impl Iterator<Item = &ServedTarget> {
         self.by_node.get(node).into_iter().flatten()
     }
 }
@@ -100,7 +100,7 @@ pub(super) fn concerned(
     old: &State,
     new: &State,
     keys: &BTreeSet<Key>,
-) -> BTreeSet<Place> {
+) -> BTreeSet<ServedTarget> {
     let mut search = Search { site, places, old, new, found: BTreeSet::new() };
     for key in keys {
         search.of_key(key);
@@ -120,7 +120,7 @@ struct Search<'s> {
     places: &'s Places,
     old: &'s State,
     new: &'s State,
-    found: BTreeSet<Place>,
+    found: BTreeSet<ServedTarget>,
 }
 
 fn document<'s>(state: &'s State, key: &Key) -> Option<&'s Document> {
@@ -207,7 +207,7 @@ impl<'s> Search<'s> {
 
     fn of_target(&mut self, target: &Key) {
         let places = self.places;
-        let on_nodes = |place: &&Place| place.node.is_some();
+        let on_nodes = |place: &&ServedTarget| place.node.is_some();
         match (target.kind(), target.service_name()) {
             (Kind::Service, _) => {
                 let service = ServiceName::from(target.name());

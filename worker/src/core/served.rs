@@ -21,7 +21,7 @@ use std::collections::BTreeSet;
 use std::time::Instant;
 
 use blaze_domain::config::Key;
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::state::State;
 use blaze_domain::{InstanceName, ServiceName};
 use serde_json::{Map, Value};
@@ -29,8 +29,8 @@ use serde_json::{Map, Value};
 use super::asked::Asked;
 use super::change::{Change, difference};
 use super::notice::{Config, Notice, Standing, paths, scopes};
-use super::place::{Place, Site, Source};
 use super::reach::{Places, concerned};
+use super::served_target::{ServedTarget, Site, Source};
 use super::told::{Flushed, Told};
 use super::world::World;
 
@@ -57,11 +57,11 @@ pub struct Served {
     places: Places,
     asked: Asked,
     /// Places that went since the last flush.
-    untracked: Vec<Place>,
+    untracked: Vec<ServedTarget>,
     /// Places that asked and were forgotten for others.
     evicted: u64,
     /// Places of another life that were not looked at yet: nobody knows what they were told.
-    restored: BTreeSet<Place>,
+    restored: BTreeSet<ServedTarget>,
 }
 
 impl Served {
@@ -113,7 +113,7 @@ impl Served {
     }
 
     /// Every place that is told of changes, with what it was told last.
-    pub fn told(&self) -> impl Iterator<Item = (&Place, &Told)> {
+    pub fn told(&self) -> impl Iterator<Item = (&ServedTarget, &Told)> {
         self.places.all()
     }
 
@@ -172,7 +172,7 @@ impl Served {
     /// On the broker of a layer one instance may ask from several nodes, so only the place of its
     /// document has it.
     #[must_use]
-    pub fn has_key(&self, place: &Place) -> bool {
+    pub fn has_key(&self, place: &ServedTarget) -> bool {
         self.site.node.is_some() || self.site.is_home(&self.shown.state, place)
     }
 
@@ -212,7 +212,7 @@ impl Served {
     }
 
     /// `is_open`: whether nobody knows what the place has, so that it hears how it is in any case.
-    fn look(&mut self, place: Place, is_open: bool, out: &mut Flushed) {
+    fn look(&mut self, place: ServedTarget, is_open: bool, out: &mut Flushed) {
         let told = self.places.get(&place);
         let old = self.shown.at(&self.site, &place);
         let new = self.next.at(&self.site, &place);
@@ -244,7 +244,7 @@ impl Served {
     /// A notice for each place, for a worker that begins to notify. They have the newest revision:
     /// other workers may have notified the same state with a later one than is known here.
     pub fn announce(&mut self) -> Vec<Notice> {
-        let places: Vec<(Place, String)> = self
+        let places: Vec<(ServedTarget, String)> = self
             .places
             .all()
             .filter_map(|(place, told)| Some((place.clone(), told.hash.clone()?)))
@@ -265,7 +265,12 @@ impl Served {
     /// Takes over what another life, or another worker, knew: places that it notified, and the
     /// revision up to which it did. The places count as if they had asked now, because they may
     /// well be running.
-    pub fn restore(&mut self, floor: u64, places: impl IntoIterator<Item = Place>, now: Instant) {
+    pub fn restore(
+        &mut self,
+        floor: u64,
+        places: impl IntoIterator<Item = ServedTarget>,
+        now: Instant,
+    ) {
         self.floor = self.floor.max(floor);
         for place in places {
             self.note_asked(&place, now);
@@ -304,7 +309,7 @@ impl Served {
     /// `old` is what the place was told last, as far as it is known.
     fn notice(
         &self,
-        place: &Place,
+        place: &ServedTarget,
         revision: u64,
         previous_hash: Option<String>,
         old: Option<Sources>,
@@ -335,7 +340,7 @@ impl Served {
     }
 
     /// Notes that a place asked, so that it is told of changes for a while.
-    fn note_asked(&mut self, place: &Place, now: Instant) {
+    fn note_asked(&mut self, place: &ServedTarget, now: Instant) {
         let Some(evicted) = self.asked.touch(place, now) else {
             return;
         };
@@ -346,12 +351,12 @@ impl Served {
     }
 
     /// Whether it is not told any more.
-    fn drop_unless_home(&mut self, place: &Place) -> bool {
+    fn drop_unless_home(&mut self, place: &ServedTarget) -> bool {
         !self.site.is_home(&self.next.state, place) && self.places.remove(place)
     }
 
     /// The configuration of a place that asks; `None` if there is no such service.
-    pub(super) fn ask(&mut self, place: &Place, now: Instant) -> Option<Standing> {
+    pub(super) fn ask(&mut self, place: &ServedTarget, now: Instant) -> Option<Standing> {
         let sources = self.shown.at(&self.site, place)?;
         self.note_asked(place, now);
         if self.places.get(place).is_none() {
@@ -363,7 +368,7 @@ impl Served {
 
     /// The configuration of a place that is told of changes, as it was told last.
     #[must_use]
-    pub fn standing_of(&self, place: &Place) -> Option<Standing> {
+    pub fn standing_of(&self, place: &ServedTarget) -> Option<Standing> {
         let told = self.places.get(place)?;
         let hash = told.hash.clone()?;
         let sources = self.shown.at(&self.site, place)?;
@@ -373,20 +378,26 @@ impl Served {
     /// The configuration of a place, without counting it as one that asked; `None`: nothing is
     /// there, or no such service.
     #[must_use]
-    pub fn look_up(&self, place: &Place) -> Option<Standing> {
+    pub fn look_up(&self, place: &ServedTarget) -> Option<Standing> {
         let sources = self.shown.at(&self.site, place).filter(|_| self.is_ready())?;
         let hash = sources.hash();
         Some(self.standing(place.at(&self.site), self.floor, hash, sources))
     }
 
     /// The configuration of a layer, or of a node of it, without any service.
-    pub(super) fn standing_at(&self, at: At) -> Standing {
+    pub(super) fn standing_at(&self, at: ConfigTarget) -> Standing {
         let sources = self.shown.sources(&at);
         let hash = sources.hash();
         self.standing(at, self.floor, hash, sources)
     }
 
-    fn standing(&self, at: At, revision: u64, hash: String, sources: Sources) -> Standing {
+    fn standing(
+        &self,
+        at: ConfigTarget,
+        revision: u64,
+        hash: String,
+        sources: Sources,
+    ) -> Standing {
         Standing {
             at,
             revision,

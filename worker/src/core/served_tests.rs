@@ -162,7 +162,7 @@ fn a_deleted_service_is_told_once_to_all_its_places() {
     assert!(notices.iter().all(|notice| notice.previous_hash.is_none() && notice.revision == 13));
 }
 
-fn remembered(served: &Served) -> Vec<Place> {
+fn remembered(served: &Served) -> Vec<ServedTarget> {
     served.told().map(|(place, _)| place.clone()).collect()
 }
 

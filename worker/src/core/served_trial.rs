@@ -10,7 +10,7 @@ use blaze_domain::config::{Document, Key, Kind};
 use blaze_domain::{DocumentName, NodeName};
 
 use super::{MAX_FAILED, Served, Told};
-use crate::core::place::Place;
+use crate::core::served_target::ServedTarget;
 
 /// Window of a gate that does not say how long it is, in seconds.
 const WINDOW_S: u64 = 60;
@@ -66,7 +66,7 @@ impl Served {
     /// Whether a roll-out that is on its canaries has an effect on the configuration of a place, in
     /// the shown documents: the health of such places tells whether it goes well.
     #[must_use]
-    pub fn is_changed_by(&self, uid: &str, place: &Place) -> bool {
+    pub fn is_changed_by(&self, uid: &str, place: &ServedTarget) -> bool {
         if place.node.is_none() || self.places.get(place).is_none() {
             return false;
         }
@@ -80,7 +80,7 @@ impl Served {
 
     /// What a place was told last; `None`: it is not told of changes.
     #[must_use]
-    pub fn told_to(&self, place: &Place) -> Option<&Told> {
+    pub fn told_to(&self, place: &ServedTarget) -> Option<&Told> {
         self.places.get(place)
     }
 

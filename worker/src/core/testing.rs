@@ -6,7 +6,7 @@ use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, Labels, Timestamp};
 use serde_json::Value;
 
-use super::place::{Place, Site};
+use super::served_target::{ServedTarget, Site};
 
 /// A document of a key such as `Instance/slam/0`; its uid is its key.
 pub(crate) fn document(key: &str, revision: u64, spec: Value) -> Document {
@@ -42,7 +42,7 @@ pub(crate) fn keys<const N: usize>(texts: [&str; N]) -> Vec<Key> {
 }
 
 /// `slam`, `slam/0`, each with `@node` behind it or not.
-pub(crate) fn place(text: &str) -> Place {
+pub(crate) fn place(text: &str) -> ServedTarget {
     let (name, node) = match text.split_once('@') {
         Some((name, node)) => (name, Some(node.parse().unwrap())),
         None => (text, None),
@@ -51,7 +51,7 @@ pub(crate) fn place(text: &str) -> Place {
         Some((service, instance)) => (service, Some(instance.parse().unwrap())),
         None => (name, None),
     };
-    Place { service: service.parse().unwrap(), instance, node }
+    ServedTarget { service: service.parse().unwrap(), instance, node }
 }
 
 /// Layer `edge`, on the broker of a node or of the layer.

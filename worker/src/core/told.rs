@@ -1,7 +1,7 @@
 //! What is remembered of the places, and what they are told next.
 
 use super::notice::Notice;
-use super::place::Place;
+use super::served_target::ServedTarget;
 
 /// What a place was told last.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -19,7 +19,7 @@ pub struct Flushed {
     /// ones.
     pub notices: Vec<Notice>,
     /// Places that are told of changes from now on, whether there is a notice now or not.
-    pub tracked: Vec<Place>,
+    pub tracked: Vec<ServedTarget>,
     /// Places that are not told any more: whatever is kept for them outside would become old.
-    pub untracked: Vec<Place>,
+    pub untracked: Vec<ServedTarget>,
 }

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use blaze_domain::ServiceName;
 use blaze_domain::config::Key;
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::spec::PROGRAMS;
 use blaze_domain::config::state::State;
 
-use super::place::{Place, Site};
+use super::served_target::{ServedTarget, Site};
 
 /// All that an effective configuration follows from. A clone shares everything.
 #[derive(Clone, Default)]
@@ -22,7 +22,7 @@ pub(super) struct World {
 }
 
 impl World {
-    pub(super) fn sources(&self, at: &At) -> Sources {
+    pub(super) fn sources(&self, at: &ConfigTarget) -> Sources {
         Sources::at_where(&self.state, at, |rollout| !self.failed.contains(&rollout.uid))
     }
 
@@ -32,7 +32,7 @@ impl World {
     }
 
     /// The documents that count at a place; `None` if its service is not there.
-    pub(super) fn at(&self, site: &Site, place: &Place) -> Option<Sources> {
+    pub(super) fn at(&self, site: &Site, place: &ServedTarget) -> Option<Sources> {
         self.has_service(&place.service).then(|| self.sources(&place.at(site)))
     }
 }

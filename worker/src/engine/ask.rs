@@ -82,6 +82,6 @@ impl Engine {
     }
 
     pub(super) fn freshness(&self) -> Freshness {
-        Freshness { as_of: self.replica.as_of(), now: now() }
+        Freshness { as_of: self.view.as_of(), now: now() }
     }
 }

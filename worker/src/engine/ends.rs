@@ -18,7 +18,7 @@ use blaze_domain::config::spec::PROGRAMS;
 use tokio::time::Instant;
 
 use super::Engine;
-use crate::core::{Notice, Place};
+use crate::core::{Notice, ServedTarget};
 use crate::serve::{Told, changed};
 
 /// How long the last notice of a place stays with the broker.
@@ -40,7 +40,7 @@ struct Ended {
 
 /// All of them.
 pub(super) struct Ends {
-    places: BTreeMap<Place, Ended>,
+    places: BTreeMap<ServedTarget, Ended>,
     /// Services may have come or gone since channels were last asked for.
     channels_differ: bool,
     /// Places that were not remembered, because there were too many.
@@ -54,13 +54,13 @@ impl Default for Ends {
 }
 
 /// The record key of a place.
-pub(super) fn record_key(place: &Place) -> String {
+pub(super) fn record_key(place: &ServedTarget) -> String {
     place.instance.as_ref().map(ToString::to_string).unwrap_or_default()
 }
 
 impl Ends {
     /// A place is not notified of changes any more, or its service was deleted.
-    pub(super) fn add(&mut self, place: &Place, notice: Option<&Notice>) {
+    pub(super) fn add(&mut self, place: &ServedTarget, notice: Option<&Notice>) {
         let until = Instant::now() + STAYS;
         if let Some(ended) = self.places.get_mut(place) {
             (ended.until, ended.is_taken_away) = (until, false);
@@ -74,7 +74,7 @@ impl Ends {
     }
 
     /// All of them, in their order.
-    pub(super) fn places(&self) -> impl Iterator<Item = &Place> {
+    pub(super) fn places(&self) -> impl Iterator<Item = &ServedTarget> {
         self.places.keys()
     }
 
@@ -124,7 +124,7 @@ impl Engine {
         let is_due = |ended: &Ended| ended.until + in_mind <= now;
         let due = self.ends.places.iter().filter(|(_, ended)| is_due(ended));
         let count = self.ends.places.len();
-        let due: Vec<(Place, bool)> =
+        let due: Vec<(ServedTarget, bool)> =
             due.map(|(place, ended)| (place.clone(), ended.is_taken_away)).collect();
         for (place, is_taken_away) in due {
             if self.outputs.speaker.is_waiting(&place.to_string()) {
@@ -154,7 +154,7 @@ impl Engine {
         self.serve_channels();
     }
 
-    fn take_away(&self, place: &Place) {
+    fn take_away(&self, place: &ServedTarget) {
         let Some(channel) = changed(&place.service) else { return };
         self.tell(vec![Told {
             place: place.to_string(),

@@ -40,14 +40,14 @@ impl Engine {
                 self.tell_copies_of_stream();
             }
             SyncEvent::Said(incoming) => {
-                let applied = self.replica.apply(self.without_texts(incoming), now());
+                let applied = self.view.apply(self.without_texts(incoming), now());
                 if matches!(applied, Ok(Applied::Nothing | Applied::Changed(_))) {
                     // Both understand each other: what was the matter before is so no more.
                     self.reason = None;
                 }
                 match applied {
                     // It is known to be the newest by now, which the copies are to know too.
-                    Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(false),
+                    Ok(Applied::Nothing) if self.view.is_in_sync() => self.keep(false),
                     Ok(Applied::Nothing) => {}
                     Ok(Applied::Changed(change)) => {
                         self.wants_all = false;
@@ -57,7 +57,7 @@ impl Engine {
                         self.note_texts(&change);
                         self.owe_notes();
                         // Of another store, whose revisions began anew.
-                        if self.served.floor() > self.replica.state().revision() {
+                        if self.served.floor() > self.view.state().revision() {
                             self.renew_notes();
                         }
                         self.keep(true);
@@ -88,7 +88,7 @@ impl Engine {
                     tracing::warn!(reason, "the main service is away; services get what is here");
                 }
                 self.reason = Some(reason);
-                self.replica.disconnected();
+                self.view.disconnected();
                 // A time that is still to come stays: else a link that comes and goes would put it
                 // off for ever.
                 self.catching_up = self.catching_up.filter(|wait| wait.until > Instant::now());
@@ -104,8 +104,8 @@ impl Engine {
     }
 
     fn hello(&mut self, is_safe: bool) -> v1::Hello {
-        self.replica.disconnected();
-        let resume = self.replica.resume_point();
+        self.view.disconnected();
+        let resume = self.view.resume_point();
         let site = &self.identity.site;
         let mut hello = v1::Hello {
             protocol: PROTOCOL,
@@ -137,7 +137,7 @@ impl Engine {
 
     /// What was missed in an outage comes in steps, of which only the last is told.
     fn note_catching_up(&mut self) {
-        if self.replica.is_in_sync() {
+        if self.view.is_in_sync() {
             return;
         }
         let now = Instant::now();
@@ -150,7 +150,7 @@ impl Engine {
     }
 
     fn note_sync(&mut self) {
-        let in_sync = self.replica.is_in_sync();
+        let in_sync = self.view.is_in_sync();
         if in_sync && self.catching_up.take().is_some() {
             self.flush_soon();
         }
@@ -159,7 +159,7 @@ impl Engine {
         if was != self.served.source() {
             tracing::info!(
                 in_sync,
-                revision = self.replica.state().revision(),
+                revision = self.view.state().revision(),
                 "source of configurations"
             );
         }

@@ -5,7 +5,7 @@ use tokio::time::Instant;
 
 use super::Engine;
 use crate::copy::{Found, Loaded, Notes};
-use crate::core::Replica;
+use crate::core::LayerView;
 
 impl Engine {
     /// Of one store the newer state counts; of two, what is served stays, and so it does if the
@@ -13,8 +13,8 @@ impl Engine {
     /// another worker wrote them just now.
     pub(super) fn on_found(&mut self, found: Found) {
         let Loaded { position, documents, notes } = found.loaded;
-        let is_newer = self.replica.store_id().is_none_or(|store_id| {
-            store_id == position.store_id && position.revision > self.replica.state().revision()
+        let is_newer = self.view.store_id().is_none_or(|store_id| {
+            store_id == position.store_id && position.revision > self.view.state().revision()
         });
         let is_wanted = is_newer && self.stream.is_none();
         if is_wanted {
@@ -24,7 +24,7 @@ impl Engine {
                 "services get what this copy holds"
             );
             let state = self.state_of(position.revision, documents);
-            self.replica = Replica::from_copy(position.store_id, state.clone(), position.as_of);
+            self.view = LayerView::from_copy(position.store_id, state.clone(), position.as_of);
             self.served.take_later(state);
             self.note_texts_of_all();
             self.note_all_services();

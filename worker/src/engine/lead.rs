@@ -14,7 +14,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::{Engine, SETTLE};
-use crate::core::{Place, Source};
+use crate::core::{ServedTarget, Source};
 use crate::lease::Mark;
 use crate::serve::Told;
 
@@ -59,8 +59,8 @@ impl Engine {
     /// The state that is shown, as far as it is one of a main service.
     pub(super) fn mark(&self) -> Option<Mark> {
         Some(Mark {
-            store_id: self.replica.store_id()?.to_owned(),
-            revision: self.replica.state().revision(),
+            store_id: self.view.store_id()?.to_owned(),
+            revision: self.view.state().revision(),
         })
     }
 
@@ -72,7 +72,7 @@ impl Engine {
             (None, _) => false,
             (Some(_), None) => true,
             (Some(noted), Some(shown)) => {
-                let is_newest = self.replica.is_in_sync() && self.led_at.elapsed() > TRUST_AFTER;
+                let is_newest = self.view.is_in_sync() && self.led_at.elapsed() > TRUST_AFTER;
                 noted.store_id == shown.store_id && !shown.covers(noted) && !is_newest
             }
         }
@@ -122,7 +122,7 @@ impl Engine {
     }
 
     /// Notifies every place but those that hear of a change anyway.
-    pub(super) fn announce(&mut self, except: &BTreeSet<Place>) {
+    pub(super) fn announce(&mut self, except: &BTreeSet<ServedTarget>) {
         if !self.may_announce() || !self.served.is_ready() {
             return;
         }

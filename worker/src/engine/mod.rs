@@ -36,7 +36,7 @@ use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Loaded, Notes, Position, Update, defaults, lacks_text};
-use crate::core::{Gate, Place, Replica, Served, Signs, Source};
+use crate::core::{Gate, LayerView, Served, ServedTarget, Signs, Source};
 use crate::lease::Mark;
 use ends::Ends;
 
@@ -65,7 +65,7 @@ pub const QUEUE: usize = 256;
 pub struct Engine {
     identity: Identity,
     outputs: Outputs,
-    replica: Replica,
+    view: LayerView,
     served: Served,
     /// As they are kept, and the version of the places in them.
     notes: Arc<Notes>,
@@ -108,7 +108,7 @@ pub struct Engine {
     /// When it was said last.
     acked: Instant,
     /// Places whose key is kept.
-    keyed: BTreeMap<String, Place>,
+    keyed: BTreeMap<String, ServedTarget>,
     /// Keys of an earlier life were looked for.
     has_swept: bool,
     /// Places that are not notified any more.
@@ -124,7 +124,7 @@ impl Engine {
         let now = Instant::now();
         let mut engine = Self {
             served: Served::new(identity.site.clone()),
-            replica: Replica::default(),
+            view: LayerView::default(),
             notes: Arc::default(),
             notes_version: 0,
             wants_all: false,
@@ -173,9 +173,9 @@ impl Engine {
         let is_as_kept = loaded.documents.iter().all(is_same);
         self.take_notes(&loaded.notes);
         self.notes = loaded.notes;
-        self.replica = Replica::from_copy(store_id, state.clone(), as_of);
+        self.view = LayerView::from_copy(store_id, state.clone(), as_of);
         self.served.load(state, Source::Copy);
-        self.lacks_texts = lacks_texts(self.replica.state());
+        self.lacks_texts = lacks_texts(self.view.state());
         self.note_all_services();
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up; both lose the texts that
@@ -254,8 +254,8 @@ impl Engine {
             return;
         }
         let ack = v1::Ack {
-            revision: self.replica.state().revision(),
-            digest: self.replica.digest(),
+            revision: self.view.state().revision(),
+            digest: self.view.digest(),
             services: self.services_of_ack(),
             rollouts: self.rollouts_of_ack(),
         };
@@ -265,17 +265,17 @@ impl Engine {
     /// Has the newest state kept, with the notes. `has_changed`: not only the time has moved on.
     fn keep(&self, has_changed: bool) {
         let Some(copies) = &self.outputs.copies else { return };
-        let (Some(store_id), Some(as_of)) = (self.replica.store_id(), self.replica.as_of()) else {
+        let (Some(store_id), Some(as_of)) = (self.view.store_id(), self.view.as_of()) else {
             return;
         };
         copies.store(&Update {
             position: Position {
                 store_id: store_id.to_owned(),
                 layer: self.identity.site.layer.clone(),
-                revision: self.replica.state().revision(),
+                revision: self.view.state().revision(),
                 as_of,
             },
-            state: self.replica.state().clone(),
+            state: self.view.state().clone(),
             notes: Arc::clone(&self.notes),
             has_changed,
         });
@@ -287,7 +287,7 @@ impl Engine {
             let before = Arc::clone(&self.notes);
             self.renew_notes();
             // The revision of the documents is kept with them.
-            let revision = self.replica.state().revision();
+            let revision = self.view.state().revision();
             let kept = |notes: &Notes| Notes { floor: notes.floor.max(revision), ..notes.clone() };
             if kept(&before) != kept(&self.notes) {
                 self.keep(true);

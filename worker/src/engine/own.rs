@@ -8,7 +8,7 @@ use tokio::sync::watch;
 
 use super::Engine;
 use crate::core::messages::Delivery;
-use crate::core::{Place, Standing};
+use crate::core::{ServedTarget, Standing};
 
 /// Sections that count for a worker. How it reaches the main service and where it keeps its copies
 /// is for the node file alone: a slip there could not be taken back from afar.
@@ -17,7 +17,7 @@ const SECTIONS: [&str; 1] = ["log"];
 /// The worker as a service among others.
 pub struct Own {
     /// Under which name it has a configuration.
-    pub place: Place,
+    pub place: ServedTarget,
     /// Where that is told.
     pub tell: watch::Sender<Option<Overlay>>,
 }

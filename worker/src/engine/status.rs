@@ -5,7 +5,7 @@ use blaze_domain::{InstanceName, NodeName};
 use serde_json::{Value, json};
 
 use super::{Counts, Engine, now};
-use crate::core::{Freshness, Place, Row, Source, Told};
+use crate::core::{Freshness, Row, ServedTarget, Source, Told};
 
 /// What the admin port shows.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,8 +31,8 @@ pub struct Status {
 impl Engine {
     pub(super) fn status(&mut self) -> Status {
         let site = self.identity.site.clone();
-        let freshness = Freshness { as_of: self.replica.as_of(), now: now() };
-        let digest = self.replica.digest();
+        let freshness = Freshness { as_of: self.view.as_of(), now: now() };
+        let digest = self.view.digest();
         let services = self.services();
         let rollouts = self.rollouts().into_iter().map(|state| {
             json!({
@@ -41,7 +41,7 @@ impl Engine {
             })
         });
         let rollouts: Vec<Value> = rollouts.collect();
-        let revision = self.replica.state().revision();
+        let revision = self.view.state().revision();
         let json = json!({
             "layer": site.layer.as_str(),
             "node": self.identity.node.as_str(),
@@ -66,7 +66,7 @@ impl Engine {
                 ..self.counts
             },
             is_ready: self.served.is_ready(),
-            in_sync: self.replica.is_in_sync(),
+            in_sync: self.view.is_in_sync(),
             revision,
             unwatched: self.gate.unwatched(),
             defaults_problem: self.defaults_problem.clone(),
@@ -82,7 +82,7 @@ impl Engine {
             .told()
             .map(|(place, told)| service(place, Some(told), self.signs.of(place)));
         let of_sign = self.signs.rows().filter_map(|(key, row)| {
-            let place = Place {
+            let place = ServedTarget {
                 service: key.service.clone(),
                 instance: Some(key.instance.clone()),
                 node: Some(key.node.clone()),
@@ -94,7 +94,7 @@ impl Engine {
     }
 }
 
-fn service(place: &Place, told: Option<&Told>, row: Option<&Row>) -> Value {
+fn service(place: &ServedTarget, told: Option<&Told>, row: Option<&Row>) -> Value {
     json!({
         "service": place.service.as_str(),
         "instance": place.instance.as_ref().map(InstanceName::as_str),

@@ -12,7 +12,7 @@ use super::ends::record_key;
 use super::{Engine, TOGETHER, lacks_texts, now};
 use crate::copy::lacks_text;
 use crate::core::messages::{self, Delivery, GetRequest};
-use crate::core::{Change, Flushed, Notice, Place, Standing};
+use crate::core::{Change, Flushed, Notice, ServedTarget, Standing};
 use crate::serve::{Told, changed};
 
 /// How long after the texts of secrets came everybody with secrets gets a whole answer: each asks
@@ -61,7 +61,7 @@ impl Engine {
                 told.extend(self.of_notice(notice));
             }
         }
-        let noticed: BTreeSet<Place> =
+        let noticed: BTreeSet<ServedTarget> =
             changed.into_iter().chain(gone).map(|notice| notice.place).collect();
         // What an earlier life wrote may be gone, or of another form.
         let all = if is_first { self.places() } else { tracked };
@@ -87,7 +87,7 @@ impl Engine {
         }
     }
 
-    pub(super) fn places(&self) -> Vec<Place> {
+    pub(super) fn places(&self) -> Vec<ServedTarget> {
         self.served.told().map(|(place, _)| place.clone()).collect()
     }
 
@@ -105,7 +105,7 @@ impl Engine {
 
     /// The same, of a state that is another one as a whole.
     pub(super) fn note_texts_of_all(&mut self) {
-        let lacked = std::mem::replace(&mut self.lacks_texts, lacks_texts(self.replica.state()));
+        let lacked = std::mem::replace(&mut self.lacks_texts, lacks_texts(self.view.state()));
         self.owes_texts |= self.identity.delivery == Delivery::Text && lacked && !self.lacks_texts;
     }
 
@@ -137,7 +137,7 @@ impl Engine {
     /// The key of a place that has asked for the first time.
     pub(super) fn key_of_asker(&mut self, request: &GetRequest) {
         let Some(service) = &request.service else { return };
-        let place = Place {
+        let place = ServedTarget {
             service: service.clone(),
             instance: request.instance.clone(),
             node: self.identity.site.node.clone().or_else(|| request.node.clone()),
@@ -177,7 +177,11 @@ impl Engine {
     }
 
     /// The key alone; `None` if the place has none.
-    pub(super) fn of_standing(&mut self, place: &Place, standing: &Standing) -> Option<Told> {
+    pub(super) fn of_standing(
+        &mut self,
+        place: &ServedTarget,
+        standing: &Standing,
+    ) -> Option<Told> {
         if !self.tells {
             return None;
         }
@@ -185,11 +189,11 @@ impl Engine {
     }
 
     /// That the key is to go, if it is this place's.
-    fn without_key(&mut self, place: &Place) -> Option<Told> {
+    fn without_key(&mut self, place: &ServedTarget) -> Option<Told> {
         Some(Told { place: place.to_string(), key: Some(self.key_to_go(place)?), notice: None })
     }
 
-    fn key_to_go(&mut self, place: &Place) -> Option<(String, Option<Bytes>)> {
+    fn key_to_go(&mut self, place: &ServedTarget) -> Option<(String, Option<Bytes>)> {
         let name = self.key_name(place);
         if self.keyed.get(&name) != Some(place) {
             return None;
@@ -198,7 +202,11 @@ impl Engine {
         Some((name, None))
     }
 
-    fn key(&mut self, place: &Place, standing: &Standing) -> Option<(String, Option<Bytes>)> {
+    fn key(
+        &mut self,
+        place: &ServedTarget,
+        standing: &Standing,
+    ) -> Option<(String, Option<Bytes>)> {
         if !self.served.has_key(place) {
             // It had one while its document was there.
             return self.key_to_go(place);
@@ -211,7 +219,7 @@ impl Engine {
     }
 
     /// Without the prefix of the server.
-    fn key_name(&self, place: &Place) -> String {
+    fn key_name(&self, place: &ServedTarget) -> String {
         messages::config_key(&place.service, place.instance.as_ref())
     }
 }

@@ -1,4 +1,4 @@
-//! How far services were told, as whoever leads leaves it beside the lease.
+//! How far services were told, as the leading worker leaves it beside the lease.
 
 use serde::{Deserialize, Serialize};
 

@@ -8,7 +8,7 @@
 //!
 //! It lies in the layer's MongoDB ([`MongoLease`]), else in Redis ([`RedisLease`]), else it is
 //! membership of a consumer group on the layer's Kafka ([`KafkaLease`]). Beside it lies how far
-//! services were told ([`Mark`]): whoever takes over tells the rest.
+//! services were told ([`Mark`]): the worker that takes over tells the rest.
 
 #[cfg(feature = "conformance")]
 pub mod conformance;

@@ -17,7 +17,7 @@ use super::super::view::{may_reveal, view};
 use super::super::watch::{Filter, WatchStream, is_in_layer, trimmed};
 use super::{ConfigService, WAIT_FOR_REVISION, not_found, selector};
 use crate::auth::Right;
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 use blaze_domain::config::placement::{Placement, placement};
 use blaze_domain::config::spec::PROGRAMS;
 use blaze_domain::config::state::{State, redacted};
@@ -314,7 +314,12 @@ impl ConfigService {
     }
 
     /// The place that is meant: names must exist, and what is absent is taken from what is there.
-    fn resolve(&self, caller: &Caller, state: &State, asked: &Place) -> Result<At, Problem> {
+    fn resolve(
+        &self,
+        caller: &Caller,
+        state: &State,
+        asked: &Place,
+    ) -> Result<ConfigTarget, Problem> {
         let view = view(&caller.claims);
         let exists = |key: Key| {
             view.check_key(state, &key)?;
@@ -327,7 +332,7 @@ impl ConfigService {
         if asked.service.is_none() && asked.node.is_none() && asked.layer.is_none() {
             return invalid("say for which service, node or layer");
         }
-        let mut at = At {
+        let mut at = ConfigTarget {
             service: asked.service.clone(),
             instance: asked.instance.as_ref().map(DocumentName::from),
             layer: asked.layer.clone(),

@@ -1,5 +1,5 @@
-//! Writes: each becomes a request for the committer. A write that has begun goes on when whoever
-//! asked goes away.
+//! Writes: each becomes a request for the committer. A write that has begun goes on when its caller
+//! goes away.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -87,15 +87,15 @@ fn topic_row(topic: &TopicFacts) -> Value {
 
 /// What compression does to a topic; null where it does nothing.
 fn compression(topic: &TopicFacts) -> Value {
-    let press = &topic.press;
-    if press.messages == 0 {
+    let stats = &topic.compress_stats;
+    if stats.messages == 0 {
         return Value::Null;
     }
     json!({
-        "level": topic.level, "messages": press.messages, "bytes_before": press.before,
-        "bytes_after": press.after,
-        "ratio": rounded(press.after as f64 / press.before.max(1) as f64),
-        "cpu_ms": rounded(press.seconds * 1e3 / press.messages as f64),
+        "level": topic.level, "messages": stats.messages, "bytes_before": stats.before,
+        "bytes_after": stats.after,
+        "ratio": rounded(stats.after as f64 / stats.before.max(1) as f64),
+        "cpu_ms": rounded(stats.seconds * 1e3 / stats.messages as f64),
         "as_it_is": topic.level == 0,
     })
 }

@@ -10,9 +10,9 @@ use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 
 use super::*;
+use crate::lane::compress_stage::CompressionRules;
 use crate::lane::core::DataConfig;
 use crate::lane::path::TopicInfo;
-use crate::lane::press::CompressionRules;
 use crate::lane::writer::NewWriter;
 use crate::link::{EngineConfig, Limits};
 use crate::plan::{Bridge, LaneSpec, Target, TopicPlan};
@@ -167,7 +167,7 @@ fn pictures_cross_the_link_compressed_while_threads_come_and_go() {
         pair.cloud.codec().unwrap().resize(1 + usize::from(byte % 2)).unwrap();
         // A publisher that the pool keeps up with: what waits for it is bounded, and what is beyond
         // that would be dropped.
-        let waiting = |plane: &Plane| plane.read(|state| state.core.press_counters().waiting);
+        let waiting = |plane: &Plane| plane.read(|state| state.core.compress_counters().waiting);
         eventually(|| {
             pair.carry();
             waiting(&pair.robot) < 2 && waiting(&pair.cloud) < 2
@@ -179,10 +179,10 @@ fn pictures_cross_the_link_compressed_while_threads_come_and_go() {
     });
     assert_eq!(pair.arrived(), (0..60).collect::<Vec<u8>>());
     let topic = pair.topic;
-    let press = pair.robot.read(|state| state.core.path(topic).press);
-    assert_eq!(press.before, 60 * BYTES as u64);
-    assert!(press.after < press.before / 50, "{press:?}");
-    let waiting = pair.cloud.read(|state| state.core.press_counters().waiting);
+    let stats = pair.robot.read(|state| state.core.path(topic).compress_stats);
+    assert_eq!(stats.before, 60 * BYTES as u64);
+    assert!(stats.after < stats.before / 50, "{stats:?}");
+    let waiting = pair.cloud.read(|state| state.core.compress_counters().waiting);
     assert_eq!(waiting, 0);
 }
 
@@ -201,7 +201,7 @@ fn a_codec_that_panics_costs_no_message() {
         pair.carry();
         pair.arrived() == [6, 7, 8]
     });
-    assert_eq!(pair.robot.read(|state| state.core.press_counters().failed), 1);
+    assert_eq!(pair.robot.read(|state| state.core.compress_counters().failed), 1);
     assert_eq!(pair.robot.codec().unwrap().counters().threads, 1);
 }
 
@@ -218,7 +218,7 @@ fn stopped_with_pictures_that_wait_it_counts_them_and_the_rest_goes_as_it_is() {
     for byte in 0..5 {
         pair.publish(byte);
     }
-    eventually(|| pair.robot.read(|state| state.core.press_counters().waiting) == 4);
+    eventually(|| pair.robot.read(|state| state.core.compress_counters().waiting) == 4);
     pair.robot.stop_compression();
     assert_eq!(pair.dropped(DropReason::Shutdown), 4);
     pair.publish(5);
@@ -231,7 +231,7 @@ fn stopped_with_pictures_that_wait_it_counts_them_and_the_rest_goes_as_it_is() {
     assert_eq!(pair.dropped(DropReason::Shutdown), 4);
 }
 
-/// They hold it only while they are in a turn.
+/// They hold it only while they run a job.
 #[test]
 fn the_threads_end_with_the_message_path() {
     let ended = Arc::new(AtomicUsize::new(0));

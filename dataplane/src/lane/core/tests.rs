@@ -1,8 +1,8 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
 mod allocation;
+mod compress_stage;
 mod load;
-mod press;
 mod succession;
 
 use std::collections::BTreeMap;

@@ -169,7 +169,7 @@ impl Hostile {
         if !settled {
             header.unsettled = u32::try_from(header.link_sequence).unwrap();
         }
-        let length = u32::try_from(frame.wire_len()).unwrap();
+        let length = u32::try_from(frame.received_len()).unwrap();
         let mut out = DatagramBuilder::new(1300);
         out.put_part(&part(message, length, 0, length, behind), frame);
         self.send(out.finish(&header), Priority::State);
@@ -213,7 +213,7 @@ fn waiting_messages_of_a_hostile_peer_stay_within_bounds() {
     for message in 2..5_000u32 {
         let frame = sim::frame(Post::reliable(message), u64::from(message));
         let mut out = DatagramBuilder::new(1300);
-        let length = u32::try_from(frame.wire_len()).unwrap();
+        let length = u32::try_from(frame.received_len()).unwrap();
         // Each waits for a message that never comes.
         out.put_part(&part(message * 2, length, 0, length, 1), &frame);
         let header = hostile.header(Priority::State);
@@ -272,7 +272,7 @@ fn jumping_sequences_and_floors_do_no_harm() {
     let mut hostile = Hostile::new(1);
     let mut random = Random(5);
     let frame = sim::frame(Post::small(1), 1);
-    let length = u32::try_from(frame.wire_len()).unwrap();
+    let length = u32::try_from(frame.received_len()).unwrap();
     for _ in 0..30_000 {
         let mut out = DatagramBuilder::new(1300);
         let message = u32::try_from(random.next() >> 32).unwrap().max(2);

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::Header;
+use crate::frame::HOPS_AND_AGE_BYTES;
 use blaze_domain::{Origin, Priority, WriterId};
 use proptest::prelude::*;
 
@@ -78,14 +79,19 @@ fn hops_and_age_stay_beside_the_header() {
 #[test]
 fn a_header_without_room_is_an_error() {
     let with_header_bytes = |bytes: usize| {
-        let of = |length: usize| Header { traceparent: "t".repeat(length), ..header() };
+        let of = |length: usize| Header {
+            traceparent: "t".repeat(length),
+            hops: 0,
+            age_us: 0,
+            ..header()
+        };
         let short = Frame::new(&of(3_000), Bytes::new()).unwrap().head().len() - PREFIX_BYTES;
         Frame::new(&of(3_000 + bytes - short), Bytes::new()).unwrap()
     };
     for (free, size, fits) in
         [(4, 127, true), (4, 128, false), (7, MAX_PAYLOAD_BYTES as u64, true), (0, 0, false)]
     {
-        let original = with_header_bytes(MAX_HEADER_BYTES - free);
+        let original = with_header_bytes(MAX_HEADER_BYTES - HOPS_AND_AGE_BYTES - free);
         let packed = original.compressed(Bytes::from_static(b"p"), size);
         assert_eq!(packed.is_ok(), fits, "{free} bytes free, size {size}: {packed:?}");
         match packed {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use blaze_domain::control::LeaseKind;
 use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
-use blaze_runtime::config::{Loaded, LocatedFault, Place, Schema, Sources, load_typed};
+use blaze_runtime::config::{Loaded, LocatedFault, Schema, Sources, ValueOrigin, load_typed};
 
 const FIXTURE: &str = include_str!("../../../fixtures/blaze.yaml");
 const DOCUMENTATION: &str = include_str!("../../../../docs/node-file.md");
@@ -43,7 +43,7 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
         .warnings
         .iter()
         .map(|warning| match &warning.place {
-            Place::File { file: named, line } if Path::new(&**named) == file => {
+            ValueOrigin::File { file: named, line } if Path::new(&**named) == file => {
                 (*line, warning.path.as_str(), warning.detail.as_str())
             }
             place => panic!("{place:?}"),

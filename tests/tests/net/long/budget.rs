@@ -1,6 +1,6 @@
 //! The budget of a link under two saturating cameras: small topics keep their rate, images get what
-//! F9 gives them, and no second carries more than the limit. Each row is one combination of link,
-//! limit, sharing and compression.
+//! the allocation gives them, and no second carries more than the limit. Each row combines a link,
+//! a limit, sharing and compression.
 
 use std::io::Write as _;
 use std::sync::OnceLock;
@@ -29,7 +29,7 @@ const IMAGE_HZ: f64 = 30.0;
 /// Pictures of the recording that are published in turn.
 const PICTURES: usize = 60;
 
-/// The small topics of the paper with their rates (R2), as a Jackal publishes them.
+/// The small topics of a Jackal with the rates at which it publishes them.
 fn small() -> Vec<Stream> {
     vec![
         stream("encoder_odom", 49.71, 700),
@@ -229,7 +229,7 @@ fn size(row: &Row, allocation: &Value, stream: &Stream) -> u64 {
     }
 }
 
-/// The rates of F9 on what ω leaves of so many wire bytes per second.
+/// The rates of the allocation on what ω leaves of so many wire bytes per second.
 fn reckoned(
     row: &Row,
     wire_bytes_per_s: f64,

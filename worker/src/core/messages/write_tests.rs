@@ -1,4 +1,4 @@
-use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::effective::{ConfigTarget, Sources};
 
 use super::*;
 use crate::core::Source;
@@ -17,7 +17,7 @@ fn freshness() -> Freshness {
 /// The configuration of `slam/0` at `robot-1`, made of these members.
 fn standing(config: &Value) -> Standing {
     let state = state(431, [document("Service/slam", 431, json!({"config": config}))]);
-    let at = At {
+    let at = ConfigTarget {
         service: Some("slam".parse().unwrap()),
         instance: Some("0".parse().unwrap()),
         layer: Some("edge".parse().unwrap()),

@@ -1,6 +1,6 @@
 //! What bridges carry, and which topics another flow could go on with.
 
-use blaze_brokers::{Begin, Place};
+use blaze_brokers::{Begin, ConsumerOffset};
 
 use super::*;
 use crate::lane::load::{Loads, TopicLoad};
@@ -27,7 +27,7 @@ impl Bench {
             at: self.now,
             broker_age_us: 0,
             kept: false,
-            place: Some(Place { partition: 0, offset, appended_ms: None }),
+            place: Some(ConsumerOffset { partition: 0, offset, appended_ms: None }),
         };
         let mut batch: Vec<Received> = offsets.clone().map(received).collect();
         self.core.ingest(self.now, WALL, self.topic, Scope::Layer, &mut batch, &mut self.link);

@@ -1,6 +1,6 @@
 //! Subscriptions that begin at an offset of the topic.
 
-use blaze_brokers::{Begin, Broker, Place, SubscribeOptions};
+use blaze_brokers::{Begin, Broker, ConsumerOffset, SubscribeOptions};
 use blaze_domain::names::ChannelName;
 use blaze_tests::servers::unique_name;
 
@@ -16,7 +16,10 @@ async fn from(broker: &dyn Broker, channel: &ChannelName, begin: Begin) -> (Read
 }
 
 /// Receives frames and asserts that they are these.
-async fn expect(reader: &mut Reader, sequences: std::ops::RangeInclusive<u64>) -> Vec<Place> {
+async fn expect(
+    reader: &mut Reader,
+    sequences: std::ops::RangeInclusive<u64>,
+) -> Vec<ConsumerOffset> {
     let mut places = Vec::new();
     for sequence in sequences {
         let received = reader.next().await;

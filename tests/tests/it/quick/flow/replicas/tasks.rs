@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_brokers::{Begin, Content, Place, PublisherOptions, Received};
+use blaze_brokers::{Begin, ConsumerOffset, Content, PublisherOptions, Received};
 use blaze_domain::{Scope, TopicName};
 use blaze_flow::control::{Duty, Output, read_replica_message};
 use blaze_flow::lane::path::TopicInfo;
@@ -46,7 +46,7 @@ impl World {
                     at: now,
                     broker_age_us: 0,
                     kept: false,
-                    place: (scope == Scope::Layer).then_some(Place {
+                    place: (scope == Scope::Layer).then_some(ConsumerOffset {
                         partition: 0,
                         offset: *next as i64,
                         appended_ms: None,

@@ -36,7 +36,7 @@ impl TopicEffort {
 
 /// Bytes before and after, and what it cost.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct PressStats {
+pub struct CompressStats {
     /// Messages that were compressed, or tried.
     pub messages: u64,
     /// Bytes of their payloads before.
@@ -47,7 +47,7 @@ pub struct PressStats {
     pub seconds: f64,
 }
 
-impl PressStats {
+impl CompressStats {
     pub(super) fn note(&mut self, done: &Compressed) {
         self.messages += 1;
         self.before += done.before as u64;

@@ -129,9 +129,9 @@ impl Hands {
             self.acknowledge();
             self.pass(Duration::from_secs(3));
         }
-        let counters = self.bench.core.press_counters();
+        let counters = self.bench.core.compress_counters();
         assert_eq!((counters.waiting, counters.waiting_bytes), (0, 0));
-        let waiting: Vec<u64> = self.path().bridges.iter().map(|bridge| bridge.pressing).collect();
+        let waiting: Vec<u64> = self.path().bridges.iter().map(|bridge| bridge.in_codec).collect();
         assert!(waiting.iter().all(|messages| *messages == 0), "{waiting:?}");
         self.check();
     }

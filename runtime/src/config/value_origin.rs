@@ -7,9 +7,9 @@ use std::sync::Arc;
 /// Begins the detail of the fault that a text has more documents than allowed.
 pub(super) const TOO_MANY_DOCUMENTS: &str = "holds too many documents";
 
-/// Where a value comes from.
+/// Where a value of the configuration comes from.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Place {
+pub enum ValueOrigin {
     /// Nowhere in particular: there is no file.
     Nowhere,
     /// A line of a file, counted from 1; 0: the file as a whole.
@@ -34,7 +34,7 @@ pub enum Place {
     Override(Arc<str>),
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for ValueOrigin {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Nowhere => f.write_str("configuration"),
@@ -52,7 +52,7 @@ impl fmt::Display for Place {
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct LocatedFault {
     /// Where it stands.
-    pub place: Place,
+    pub place: ValueOrigin,
     /// Which value, such as `flow.topics[0].match`; empty: the whole.
     pub path: String,
     /// What is wrong with it.
@@ -83,11 +83,11 @@ impl std::error::Error for LocatedFault {}
 /// The place of every value of a document, by its path.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Places {
-    by_path: BTreeMap<String, Place>,
+    by_path: BTreeMap<String, ValueOrigin>,
 }
 
 impl Places {
-    pub(super) fn set(&mut self, path: &str, place: Place) {
+    pub(super) fn set(&mut self, path: &str, place: ValueOrigin) {
         self.by_path.insert(path.to_owned(), place);
     }
 
@@ -103,14 +103,14 @@ impl Places {
     }
 
     /// The place of a path, or of the nearest ancestor that has one.
-    pub(super) fn locate(&self, path: &str) -> Place {
+    pub(super) fn locate(&self, path: &str) -> ValueOrigin {
         let mut path = path;
         loop {
             if let Some(place) = self.by_path.get(path) {
                 return place.clone();
             }
             if path.is_empty() {
-                return Place::Nowhere;
+                return ValueOrigin::Nowhere;
             }
             path = path.rfind(['.', '[']).map_or("", |end| &path[..end]);
         }
@@ -128,9 +128,9 @@ mod tests {
 
     #[test]
     fn missing_paths_have_the_place_of_their_ancestor() {
-        let line = |line| Place::File { file: Arc::from("a.yaml"), line };
+        let line = |line| ValueOrigin::File { file: Arc::from("a.yaml"), line };
         let mut places = Places::default();
-        assert_eq!(places.locate("flow"), Place::Nowhere);
+        assert_eq!(places.locate("flow"), ValueOrigin::Nowhere);
         places.set("", line(1));
         places.set("flow", line(2));
         places.set("flow.topics[0]", line(5));
@@ -147,7 +147,7 @@ mod tests {
     #[test]
     fn a_fault_reads_as_documented() {
         let fault = LocatedFault {
-            place: Place::File { file: Arc::from("blaze.yaml"), line: 12 },
+            place: ValueOrigin::File { file: Arc::from("blaze.yaml"), line: 12 },
             path: "flow.bandwidth.limit_mbps".to_owned(),
             detail: "expected a number".to_owned(),
         };

@@ -3,7 +3,7 @@
 use std::fmt;
 
 pub use blaze_domain::config::ConfigSource as Source;
-use blaze_domain::config::effective::At;
+use blaze_domain::config::effective::ConfigTarget;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, Kind};
 use blaze_domain::{DocumentName, InstanceName, LayerName, NodeName, ServiceName};
@@ -18,13 +18,13 @@ pub struct Site {
     pub node: Option<NodeName>,
 }
 
-/// Who has a configuration of its own: an instance, or a service without one, at a node or at the
+/// Who is served a configuration: an instance, or a service without one, at a node or at the
 /// layer alone.
 ///
 /// Ordered by service first, then instance (none before all others), so that the places of a
 /// service are a range.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-pub struct Place {
+pub struct ServedTarget {
     /// Which service.
     pub service: ServiceName,
     /// Which instance of it; `None`: the service without instance.
@@ -33,11 +33,11 @@ pub struct Place {
     pub node: Option<NodeName>,
 }
 
-impl Place {
+impl ServedTarget {
     /// The same for [`Sources`](blaze_domain::config::effective::Sources).
     #[must_use]
-    pub fn at(&self, site: &Site) -> At {
-        At {
+    pub fn at(&self, site: &Site) -> ConfigTarget {
+        ConfigTarget {
             service: Some(self.service.clone()),
             instance: self.instance.as_ref().map(DocumentName::from),
             layer: Some(site.layer.clone()),
@@ -52,7 +52,7 @@ impl Place {
 }
 
 /// `slam`, `slam/0`, `slam/0 at robot-1`.
-impl fmt::Display for Place {
+impl fmt::Display for ServedTarget {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.service)?;
         if let Some(instance) = &self.instance {
@@ -74,7 +74,7 @@ impl Site {
     /// before anybody has asked for them. Those placed on another node run there, and that node's
     /// worker tells them; if one asks here all the same, it is told because it asked. On the broker
     /// of a layer these are all instances of the view, each at the node that its document names.
-    pub(super) fn home(&self, state: &State, document: &Document) -> Option<Place> {
+    pub(super) fn home(&self, state: &State, document: &Document) -> Option<ServedTarget> {
         let (service, instance) = match document.key.kind() {
             Kind::Service => (ServiceName::from(document.key.name()), None),
             Kind::Instance => {
@@ -90,7 +90,7 @@ impl Site {
             (Some(own), _) => Some(own.clone()),
             (None, _) => document.spec_node().and_then(|name| name.parse().ok()),
         };
-        Some(Place { service, instance, node })
+        Some(ServedTarget { service, instance, node })
     }
 
     fn may_run(&self, own: &NodeName, instance: &Document) -> bool {
@@ -102,7 +102,7 @@ impl Site {
     }
 
     /// Whether a document alone makes a place one of those that are told of changes.
-    pub(super) fn is_home(&self, state: &State, place: &Place) -> bool {
+    pub(super) fn is_home(&self, state: &State, place: &ServedTarget) -> bool {
         let key = match &place.instance {
             Some(instance) => Key::instance(place.service.clone(), instance.into()),
             None => Key::service(&place.service),

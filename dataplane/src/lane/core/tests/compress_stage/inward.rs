@@ -112,7 +112,7 @@ fn where_the_pool_is_behind_who_brings_more_does_it_himself() {
     }
     assert_eq!((hands.quick, hands.jobs.len()), (4, 0));
     hands.deliver(compressed(1, 5, 4 * MIB));
-    assert_eq!((hands.quick, hands.jobs.len()), (4, 1), "one turn is the caller's");
+    assert_eq!((hands.quick, hands.jobs.len()), (4, 1), "one job is for the caller");
     hands.end(0);
     assert_eq!(hands.written(), [(1, 1, 4 * MIB)], "the one that waits longest");
     hands.run();

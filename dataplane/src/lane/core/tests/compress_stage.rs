@@ -11,19 +11,19 @@ use blaze_domain::node_file::{Codec, Compression};
 use super::*;
 use crate::codec::pool::Urgency;
 use crate::codec::{Compressed, Done, Work};
-use crate::lane::press::{CompressionRules, PressJob};
+use crate::lane::compress_stage::{CodecJob, CompressionRules};
 
 /// Worth compressing, and done in a moment.
 const SMALL: usize = 2_000;
 /// It makes its topic large.
 const LARGE: usize = 100_000;
 
-/// A flow, the turns at the codec that it has asked for, and what was begun.
+/// A flow, the jobs that it has requested of the pool, and what was begun.
 struct Hands {
     bench: Bench,
     quick: usize,
     long: usize,
-    jobs: Vec<PressJob>,
+    jobs: Vec<CodecJob>,
 }
 
 /// A bridge from the node scope to another flow.
@@ -52,11 +52,11 @@ impl Hands {
 
     /// What is asked of the pool, and of the caller.
     fn look(&mut self) {
-        let turns = self.bench.core.take_turns();
-        self.quick += turns.quick;
-        self.long += turns.long;
-        for _ in 0..turns.own {
-            self.jobs.extend(self.bench.core.begin_own());
+        let requests = self.bench.core.take_pool_requests();
+        self.quick += requests.quick;
+        self.long += requests.long;
+        for _ in 0..requests.by_caller {
+            self.jobs.extend(self.bench.core.begin_by_caller());
         }
     }
 
@@ -72,13 +72,13 @@ impl Hands {
         }
     }
 
-    /// A thread takes a turn that was asked for. `false`: nothing was left to be done.
+    /// A thread runs a job that was requested. `false`: nothing was left to be done.
     fn begin(&mut self, urgency: Urgency) -> bool {
-        let turns = match urgency {
+        let requests = match urgency {
             Urgency::Quick => &mut self.quick,
             Urgency::Long => &mut self.long,
         };
-        *turns = turns.checked_sub(1).unwrap();
+        *requests = requests.checked_sub(1).unwrap();
         let job = self.bench.core.begin(self.bench.now, urgency, &mut self.bench.link);
         self.look();
         let has_begun = job.is_some();
@@ -89,7 +89,7 @@ impl Hands {
     /// What was begun ends like this.
     fn end_with(&mut self, at: usize, done: Done) {
         let job = self.jobs.remove(at);
-        self.bench.core.pressed(self.bench.now, job.ticket, done, &mut self.bench.link);
+        self.bench.core.finished(self.bench.now, job.ticket, done, &mut self.bench.link);
         self.look();
     }
 

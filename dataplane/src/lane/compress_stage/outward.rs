@@ -6,7 +6,7 @@ use blaze_domain::{DropReason, WriterId};
 use blaze_proto::Frame;
 use smallvec::SmallVec;
 
-use super::{Arrival, Line, PressJob, PressTicket};
+use super::{Arrival, CodecJob, CodecTicket, Line};
 use crate::codec::order::Ticket;
 use crate::codec::pool::Urgency;
 use crate::codec::{Done, Work};
@@ -31,14 +31,14 @@ pub(super) struct Outward {
 impl BridgeState {
     /// A message of it goes to the codec. It is counted as taken when it leaves there: it may go to
     /// another bridge.
-    fn goes_to_press(&mut self, bytes: u64) {
-        self.pressing += 1;
+    fn enters_codec(&mut self, bytes: u64) {
+        self.in_codec += 1;
         self.stats.taken.remove(bytes);
     }
 
     /// It comes back.
-    fn comes_from_press(&mut self, bytes: u64) {
-        self.pressing = self.pressing.saturating_sub(1);
+    fn leaves_codec(&mut self, bytes: u64) {
+        self.in_codec = self.in_codec.saturating_sub(1);
         self.stats.taken.add(bytes);
     }
 
@@ -66,7 +66,7 @@ impl TopicPath {
 
 impl DataCore {
     /// Takes a message that lanes have admitted.
-    pub(in crate::lane) fn press_out(
+    pub(in crate::lane) fn compress_out(
         &mut self,
         now: Instant,
         topic: TopicId,
@@ -78,36 +78,41 @@ impl DataCore {
         let line = (topic, frame.writer());
         let bytes = frame.payload().len();
         let level = self.level_for(now, topic, bytes, &lanes, link);
-        if level.is_none() && self.press.out.is_clear(&line) {
+        if level.is_none() && self.compress.out.is_clear(&line) {
             self.put_to_lanes(now, topic, lanes, link);
             return;
         }
         let path = &mut self.topics[topic.0 as usize];
         for (at, waiting) in &lanes {
-            path.bridges[*at].goes_to_press(waiting.bytes);
+            path.bridges[*at].enters_codec(waiting.bytes);
         }
         let is_large = lanes.iter().any(|(_, waiting)| waiting.large);
         let keep = if is_large { path.keep_newest() } else { 0 };
         let urgency = if is_large || bytes > QUICK_BYTES { Urgency::Long } else { Urgency::Quick };
         let refused = if let Some(level) = level {
-            let pushed =
-                self.press.out.push_waiting(line, urgency, Outward { level, lanes }, bytes, keep);
+            let pushed = self.compress.out.push_waiting(
+                line,
+                urgency,
+                Outward { level, lanes },
+                bytes,
+                keep,
+            );
             for out in &pushed.gave_way {
                 self.lose(topic, out, DropReason::QueueFull);
             }
             match pushed.refused {
                 Some((out, _)) if arrival == Arrival::Kept => {
                     let as_it_is = Outward { level: 0, ..out };
-                    self.press.out.push_ready(line, as_it_is, bytes).err()
+                    self.compress.out.push_ready(line, as_it_is, bytes).err()
                 }
                 refused => refused,
             }
         } else {
             let out = Outward { level: 0, lanes };
-            self.press.out.push_ready(line, out, bytes).err()
+            self.compress.out.push_ready(line, out, bytes).err()
         };
         if let Some((out, _)) = refused {
-            self.press.refused += 1;
+            self.compress.refused += 1;
             self.lose(topic, &out, DropReason::QueueFull);
         }
         self.flush_out(now, line, link);
@@ -125,7 +130,7 @@ impl DataCore {
         let path = &mut self.topics[topic.0 as usize];
         let takes =
             |path: &TopicPath| lanes.iter().any(|(at, _)| path.bridges[*at].takes_lz4(link));
-        if !self.press.enabled || !path.is_worth(bytes) || !takes(path) {
+        if !self.compress.enabled || !path.is_worth(bytes) || !takes(path) {
             return None;
         }
         path.worth_rate.add(now, bytes as u64);
@@ -142,7 +147,7 @@ impl DataCore {
         link: &dyn LaneLink,
     ) {
         let path = &mut self.topics[topic.0 as usize];
-        if !self.press.enabled || !path.is_worth(bytes) {
+        if !self.compress.enabled || !path.is_worth(bytes) {
             self.allocation_due |= path.sent_size.note(now, bytes as u64);
             return;
         }
@@ -158,46 +163,46 @@ impl DataCore {
         now: Instant,
         urgency: Urgency,
         link: &mut dyn LaneLink,
-    ) -> Option<PressJob> {
+    ) -> Option<CodecJob> {
         loop {
-            let (place, out) = self.press.out.begin(urgency)?;
+            let (place, out) = self.compress.out.begin(urgency)?;
             let bridges = &mut self.topics[place.key().0.0 as usize].bridges;
             out.lanes.retain(|(at, waiting)| {
                 let is_late = waiting.is_too_old(now);
                 if is_late {
                     let bridge = &mut bridges[*at];
-                    bridge.comes_from_press(waiting.bytes);
+                    bridge.leaves_codec(waiting.bytes);
                     bridge.stats.dropped.add(DropReason::Lifespan, 1);
                 }
                 !is_late
             });
             if let Some((_, waiting)) = out.lanes.first() {
-                return Some(PressJob {
-                    ticket: PressTicket { place, outward: true },
+                return Some(CodecJob {
+                    ticket: CodecTicket { place, outward: true },
                     payload: waiting.frame.payload().clone(),
                     work: Work::Compress(out.level),
                 });
             }
-            self.press.out.give_up(&place);
+            self.compress.out.give_up(&place);
             self.flush_out(now, *place.key(), link);
             self.stir();
         }
     }
 
-    /// Takes what became of a message. Whatever that is, it leaves.
-    pub(super) fn pressed_out(
+    /// Takes the result of a job. Whatever it is, the message leaves.
+    pub(super) fn finished_out(
         &mut self,
         now: Instant,
         place: &Ticket<TopicId, WriterId>,
         done: Done,
         link: &mut dyn LaneLink,
     ) {
-        let Some(out) = self.press.out.begun(place) else { return };
+        let Some(out) = self.compress.out.begun(place) else { return };
         let path = &mut self.topics[place.key().0.0 as usize];
         let mut level = 0;
         if let Done::Compressed(done) = done {
             path.effort.compressed(now, &done);
-            path.press.note(&done);
+            path.compress_stats.note(&done);
             level = done.level;
             for (at, waiting) in &mut out.lanes {
                 if !path.bridges[*at].takes_lz4(link) {
@@ -219,16 +224,16 @@ impl DataCore {
         } else {
             path.sent_size.note(now, bytes as u64)
         };
-        self.press.out.finish(place, bytes);
+        self.compress.out.finish(place, bytes);
         self.flush_out(now, *place.key(), link);
     }
 
     /// Hands on what is next in a line.
     pub(super) fn flush_out(&mut self, now: Instant, line: Line, link: &mut dyn LaneLink) {
         let topic = line.0;
-        while let Some(Outward { lanes, .. }) = self.press.out.pop_ready(&line) {
+        while let Some(Outward { lanes, .. }) = self.compress.out.pop_ready(&line) {
             for (at, waiting) in &lanes {
-                self.topics[topic.0 as usize].bridges[*at].comes_from_press(waiting.bytes);
+                self.topics[topic.0 as usize].bridges[*at].leaves_codec(waiting.bytes);
             }
             self.put_to_lanes(now, topic, lanes, link);
         }
@@ -256,7 +261,7 @@ impl DataCore {
     pub(super) fn lose(&mut self, topic: TopicId, out: &Outward, reason: DropReason) {
         for (at, waiting) in &out.lanes {
             let bridge = &mut self.topics[topic.0 as usize].bridges[*at];
-            bridge.comes_from_press(waiting.bytes);
+            bridge.leaves_codec(waiting.bytes);
             bridge.stats.dropped.add(reason, 1);
         }
     }

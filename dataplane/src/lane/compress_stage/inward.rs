@@ -17,7 +17,7 @@ use crate::lane::path::TopicId;
 
 impl DataCore {
     /// Takes a message that came over the link and was not seen before.
-    pub(in crate::lane) fn press_in(
+    pub(in crate::lane) fn compress_in(
         &mut self,
         now: Instant,
         topic: TopicId,
@@ -27,25 +27,25 @@ impl DataCore {
         let line = (topic, message.frame.writer());
         match message.frame.compression() {
             Compression::None => self.arrive(now, line, message, link),
-            Compression::Unknown(_) => self.refuse_pressed(topic, DropReason::DecompressError),
-            Compression::Lz4Block if self.press.enabled => self.wait_in(line, message),
+            Compression::Unknown(_) => self.refuse_inward(topic, DropReason::DecompressError),
+            Compression::Lz4Block if self.compress.enabled => self.wait_in(line, message),
             Compression::Lz4Block => match plain(&message.frame) {
                 Some(frame) => self.arrive(now, line, Admitted { frame, ..message }, link),
-                None => self.refuse_pressed(topic, DropReason::DecompressError),
+                None => self.refuse_inward(topic, DropReason::DecompressError),
             },
         }
     }
 
     /// A message that is as it was published goes on, behind what came before it.
     fn arrive(&mut self, now: Instant, line: Line, message: Admitted, link: &mut dyn LaneLink) {
-        if self.press.into.is_clear(&line) {
-            self.deliver_pressed(now, line.0, &message, link);
+        if self.compress.into.is_clear(&line) {
+            self.deliver_inward(now, line.0, &message, link);
             return;
         }
         let bytes = message.frame.payload().len();
-        if self.press.into.push_ready(line, Box::new(message), bytes).is_err() {
-            self.press.refused += 1;
-            self.refuse_pressed(line.0, DropReason::QueueFull);
+        if self.compress.into.push_ready(line, Box::new(message), bytes).is_err() {
+            self.compress.refused += 1;
+            self.refuse_inward(line.0, DropReason::QueueFull);
         }
     }
 
@@ -53,28 +53,28 @@ impl DataCore {
         let found = message.frame.payload().len();
         // One that lies about its size takes no room from others.
         let Ok(size) = lz4::announced_size(found, message.frame.uncompressed_bytes()) else {
-            self.refuse_pressed(line.0, DropReason::DecompressError);
+            self.refuse_inward(line.0, DropReason::DecompressError);
             return;
         };
         // It holds the one, and then the other.
         let bytes = found.max(size);
         let pushed =
-            self.press.into.push_waiting(line, Urgency::Quick, Box::new(message), bytes, 0);
+            self.compress.into.push_waiting(line, Urgency::Quick, Box::new(message), bytes, 0);
         if pushed.refused.is_some() {
-            self.press.refused += 1;
-            self.refuse_pressed(line.0, DropReason::QueueFull);
+            self.compress.refused += 1;
+            self.refuse_inward(line.0, DropReason::QueueFull);
         }
     }
 
-    /// Takes what became of a message.
-    pub(super) fn pressed_in(
+    /// Takes the result of a job.
+    pub(super) fn finished_in(
         &mut self,
         now: Instant,
         place: &Ticket<TopicId, WriterId>,
         done: Done,
         link: &mut dyn LaneLink,
     ) {
-        let Some(message) = self.press.into.begun(place) else {
+        let Some(message) = self.compress.into.begun(place) else {
             return;
         };
         let frame = match done {
@@ -84,22 +84,22 @@ impl DataCore {
         if let Some(frame) = frame {
             let bytes = frame.payload().len();
             message.frame = frame;
-            self.press.into.finish(place, bytes);
+            self.compress.into.finish(place, bytes);
         } else {
-            self.press.into.give_up(place);
-            self.refuse_pressed(place.key().0, DropReason::DecompressError);
+            self.compress.into.give_up(place);
+            self.refuse_inward(place.key().0, DropReason::DecompressError);
         }
         self.flush_in(now, *place.key(), link);
     }
 
     /// Hands on what is next in a line.
     pub(super) fn flush_in(&mut self, now: Instant, line: Line, link: &mut dyn LaneLink) {
-        while let Some(message) = self.press.into.pop_ready(&line) {
-            self.deliver_pressed(now, line.0, &message, link);
+        while let Some(message) = self.compress.into.pop_ready(&line) {
+            self.deliver_inward(now, line.0, &message, link);
         }
     }
 
-    fn deliver_pressed(
+    fn deliver_inward(
         &mut self,
         now: Instant,
         topic: TopicId,
@@ -108,7 +108,7 @@ impl DataCore {
     ) {
         if !self.topics[topic.0 as usize].delivers() {
             // Its bridges have ended while it was with the codec.
-            self.refuse_pressed(topic, DropReason::NoDestination);
+            self.refuse_inward(topic, DropReason::NoDestination);
             return;
         }
         // It is older by what that took.
@@ -120,7 +120,7 @@ impl DataCore {
         }
     }
 
-    pub(super) fn refuse_pressed(&mut self, topic: TopicId, reason: DropReason) {
+    pub(super) fn refuse_inward(&mut self, topic: TopicId, reason: DropReason) {
         self.topics[topic.0 as usize].ingress_drops.add(reason, 1);
     }
 }

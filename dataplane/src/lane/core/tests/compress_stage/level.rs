@@ -17,7 +17,7 @@ impl Hands {
     }
 
     /// Publishes one frame, and compresses it to so many bytes.
-    fn press(&mut self, sequence: u64, after: Option<usize>) {
+    fn compress(&mut self, sequence: u64, after: Option<usize>) {
         self.publish(1, sequence, LARGE);
         self.begin(Urgency::Long);
         self.end_as(0, after, 1);
@@ -27,15 +27,15 @@ impl Hands {
 #[test]
 fn a_rule_that_changes_makes_the_size_as_sent_anew() {
     let mut hands = Hands::new(vec![lane("cloud/c", true)]);
-    hands.press(1, Some(AT_1));
-    hands.press(2, Some(AT_1 - 1));
+    hands.compress(1, Some(AT_1));
+    hands.compress(2, Some(AT_1 - 1));
     assert_eq!(hands.size(), AT_1);
     hands.bench.core.take_allocation_due();
     hands.set(rules(9, false));
-    hands.press(3, Some(AT_3));
+    hands.compress(3, Some(AT_3));
     assert_eq!(hands.size(), AT_3);
     assert!(hands.bench.core.take_allocation_due());
-    hands.press(4, Some(AT_3 - 1));
+    hands.compress(4, Some(AT_3 - 1));
     assert_eq!(hands.size(), AT_3, "the largest at this level");
     assert!(!hands.bench.core.take_allocation_due());
     // What becomes larger is noted as ever.
@@ -46,11 +46,11 @@ fn a_rule_that_changes_makes_the_size_as_sent_anew() {
     hands.publish(1, 5, LARGE);
     assert_eq!(hands.size(), LARGE);
     hands.set(rules(9, false));
-    hands.press(6, Some(AT_3));
+    hands.compress(6, Some(AT_3));
     assert_eq!(hands.size(), AT_3);
     // The same rule once more changes nothing.
     hands.set(rules(9, false));
-    hands.press(7, Some(AT_3 - 2));
+    hands.compress(7, Some(AT_3 - 2));
     assert_eq!(hands.size(), AT_3);
 }
 
@@ -61,11 +61,11 @@ fn what_is_in_hand_while_the_rule_changes_does_not_count_for_the_new_one() {
     hands.begin(Urgency::Long);
     hands.set(rules(9, false));
     hands.end_as(0, Some(AT_1), 1);
-    hands.press(3, Some(AT_3));
+    hands.compress(3, Some(AT_3));
     // The second was to be compressed at the old level, too.
     assert_eq!(hands.size(), AT_1);
     hands.run();
-    hands.press(4, Some(AT_3));
+    hands.compress(4, Some(AT_3));
     assert_eq!(hands.size(), AT_3);
 }
 
@@ -73,7 +73,7 @@ fn what_is_in_hand_while_the_rule_changes_does_not_count_for_the_new_one() {
 fn small_messages_of_a_topic_do_not_disturb_the_size() {
     let mut hands = Hands::new(vec![lane("cloud/c", true)]);
     for sequence in 1..=5 {
-        hands.press(2 * sequence, Some(AT_1 - usize::try_from(sequence).unwrap()));
+        hands.compress(2 * sequence, Some(AT_1 - usize::try_from(sequence).unwrap()));
         hands.publish(1, 2 * sequence + 1, 100);
     }
     assert_eq!(hands.size(), AT_1 - 1);
@@ -160,7 +160,7 @@ fn what_was_found_out_by_one_rule_is_forgotten_with_it() {
     let mut hands = Hands::new(vec![lane("cloud/c", true)]);
     hands.set(rules(10, true));
     for sequence in 1..=20 {
-        hands.press(sequence, None);
+        hands.compress(sequence, None);
     }
     assert_eq!(hands.path().level(), 0, "it does not become smaller");
     hands.publish(1, 21, LARGE);

@@ -2,15 +2,17 @@
 //! back after it came over the link.
 //!
 //! ```text
-//! gate ─► outward: a place in the line of topic and writer ─► begin ─► LZ4 ─► pressed ─► in order ─► lanes
-//! link ─► inward:  a place in the line of topic and writer ─► begin ─► LZ4 ─► pressed ─► in order ─► bridges to brokers
+//! gate ─► outward: a place in the line of topic and writer ─► begin ─► LZ4 ─► finished ─► in order ─► lanes
+//! link ─► inward:  a place in the line of topic and writer ─► begin ─► LZ4 ─► finished ─► in order ─► bridges to brokers
 //! ```
 //!
 //! A message is compressed once, whatever the number of its lanes. What needs no compression waits
-//! behind what does of the same writer, so its order is that of admission. Nothing here runs the
-//! codec: whoever owns the data plane offers the [`Turns`] to a pool, and a thread that has one
-//! asks what is to be done then, and comes back with what became of it. Until it asks the message
-//! is here, and may give way to a newer one or become too old.
+//! behind what does of the same writer, so its order is that of admission.
+//!
+//! This stage only queues. The caller asks how many jobs the pool should run
+//! ([`DataCore::take_pool_requests`]). For each of them a pool thread calls [`DataCore::begin`],
+//! and [`DataCore::finished`] with the result. A message that no thread has started may still be
+//! replaced by a newer one or expire.
 
 mod inward;
 mod level;
@@ -31,7 +33,7 @@ use crate::codec::order::{Bounds, InOrder, Ticket};
 use crate::codec::pool::{Urgency, threads_for_long};
 use crate::codec::{Done, Work};
 pub(super) use inward::plain;
-pub use level::{PressStats, TopicEffort};
+pub use level::{CompressStats, TopicEffort};
 use outward::Outward;
 pub(super) use outward::ToLanes;
 
@@ -69,30 +71,30 @@ impl CompressionRules {
     }
 }
 
-/// Turns at the codec that were not asked for before.
+/// Jobs that are to be run, as far as they were not requested before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Turns {
-    /// Of the pool, for what is done in a moment.
+pub struct PoolRequests {
+    /// Short jobs for the pool.
     pub quick: usize,
-    /// Of the pool, for large payloads.
+    /// Jobs with large payloads for the pool.
     pub long: usize,
-    /// Of the calling thread, see [`DataCore::begin_own`]: the pool is behind.
-    pub own: usize,
+    /// Jobs for the calling thread, see [`DataCore::begin_by_caller`]: the pool is behind.
+    pub by_caller: usize,
 }
 
-impl AddAssign for Turns {
+impl AddAssign for PoolRequests {
     fn add_assign(&mut self, more: Self) {
         self.quick += more.quick;
         self.long += more.long;
-        self.own += more.own;
+        self.by_caller += more.by_caller;
     }
 }
 
 /// What is to be done for one message.
 #[derive(Debug, Clone)]
-pub struct PressJob {
+pub struct CodecJob {
     /// To be given back with the result.
-    pub ticket: PressTicket,
+    pub ticket: CodecTicket,
     /// The payload.
     pub payload: Bytes,
     /// What is to be done with it.
@@ -101,15 +103,15 @@ pub struct PressJob {
 
 /// Which message that is.
 #[derive(Debug, Clone, Copy)]
-pub struct PressTicket {
+pub struct CodecTicket {
     place: Ticket<TopicId, WriterId>,
     outward: bool,
 }
 
 /// What waits for the codec, and what did not get that far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct PressCounters {
-    /// Messages that wait for a turn.
+pub struct CompressCounters {
+    /// Messages that no thread has started.
     pub waiting: usize,
     /// Bytes of their payloads; of those that came over the link, as they are to become.
     pub waiting_bytes: usize,
@@ -120,38 +122,40 @@ pub struct PressCounters {
 }
 
 /// The stage in both directions.
-pub(super) struct Press {
+pub(super) struct CompressStage {
     /// Whether there is a pool.
     enabled: bool,
     rules: CompressionRules,
     out: InOrder<TopicId, WriterId, Outward>,
     into: InOrder<TopicId, WriterId, Box<Admitted>>,
-    /// Turns that were asked for and have not begun, by urgency.
-    asked: [usize; Urgency::ALL.len()],
-    /// The last quick turn was for what came over the link.
-    was_inward: bool,
+    /// Jobs that were requested and have not begun, by urgency.
+    requested: [usize; Urgency::ALL.len()],
+    /// The last short job was inbound. Short jobs alternate between both directions, so that
+    /// neither starves the other.
+    last_was_inward: bool,
     refused: u64,
     failed: u64,
 }
 
-impl Default for Press {
+impl Default for CompressStage {
     fn default() -> Self {
         let bounds = Bounds::default();
         Self {
             enabled: false,
             rules: CompressionRules::default(),
             out: InOrder::new(bounds),
-            // It was let in by its sender's pacer, and is quickly done.
+            // Inbound messages of a topic get its full byte bound while waiting: the sender has
+            // already paced them and decompression is fast.
             into: InOrder::new(Bounds { waiting_of_one: bounds.bytes_of_one, ..bounds }),
-            asked: [0; Urgency::ALL.len()],
-            was_inward: false,
+            requested: [0; Urgency::ALL.len()],
+            last_was_inward: false,
             refused: 0,
             failed: 0,
         }
     }
 }
 
-impl Press {
+impl CompressStage {
     pub(super) fn find(&self, topic: &TopicName) -> Compression {
         self.rules.find(topic)
     }
@@ -187,27 +191,27 @@ impl Press {
         self.out.waits(urgency).items + self.into.waits(urgency).items
     }
 
-    /// Turns that are still to be asked for. One whose message gave way is left to the message that
-    /// follows.
-    fn missing(&self) -> [usize; Urgency::ALL.len()] {
+    /// Jobs that are still to be requested. A request whose message was replaced is reused for the
+    /// next message.
+    fn missing_requests(&self) -> [usize; Urgency::ALL.len()] {
         Urgency::ALL
-            .map(|urgency| self.waiting(urgency).saturating_sub(self.asked[urgency as usize]))
+            .map(|urgency| self.waiting(urgency).saturating_sub(self.requested[urgency as usize]))
     }
 
-    fn turn_begins(&mut self, urgency: Urgency) {
-        let asked = &mut self.asked[urgency as usize];
-        *asked = asked.saturating_sub(1);
+    fn request_starts(&mut self, urgency: Urgency) {
+        let requested = &mut self.requested[urgency as usize];
+        *requested = requested.saturating_sub(1);
     }
 
     /// What came over the link, to be decompressed.
-    fn begin_inward(&mut self) -> Option<PressJob> {
+    fn begin_inward(&mut self) -> Option<CodecJob> {
         let (place, message) = self.into.begin(Urgency::Quick)?;
-        let job = PressJob {
-            ticket: PressTicket { place, outward: false },
+        let job = CodecJob {
+            ticket: CodecTicket { place, outward: false },
             payload: message.frame.payload().clone(),
             work: Work::Decompress(message.frame.uncompressed_bytes()),
         };
-        self.was_inward = true;
+        self.last_was_inward = true;
         Some(job)
     }
 }
@@ -216,23 +220,23 @@ impl DataCore {
     /// There is a pool: payloads are compressed from now on. Without this they go as they are, and
     /// what comes is decompressed at once.
     pub fn enable_compression(&mut self) {
-        self.press.enabled = true;
+        self.compress.enabled = true;
     }
 
     /// There is no pool any more. What waits for it is dropped; what it is at comes back.
     pub fn stop_compression(&mut self, now: Instant, link: &mut dyn LaneLink) {
-        self.press.enabled = false;
-        self.press.asked = Default::default();
+        self.compress.enabled = false;
+        self.compress.requested = Default::default();
         for urgency in Urgency::ALL {
-            while let Some(place) = self.press.out.begin(urgency).map(|(place, _)| place) {
-                if let Some(out) = self.press.out.give_up(&place) {
+            while let Some(place) = self.compress.out.begin(urgency).map(|(place, _)| place) {
+                if let Some(out) = self.compress.out.give_up(&place) {
                     self.lose(place.key().0, &out, DropReason::Shutdown);
                 }
                 self.flush_out(now, *place.key(), link);
             }
-            while let Some(place) = self.press.into.begin(urgency).map(|(place, _)| place) {
-                self.press.into.give_up(&place);
-                self.refuse_pressed(place.key().0, DropReason::Shutdown);
+            while let Some(place) = self.compress.into.begin(urgency).map(|(place, _)| place) {
+                self.compress.into.give_up(&place);
+                self.refuse_inward(place.key().0, DropReason::Shutdown);
                 self.flush_in(now, *place.key(), link);
             }
         }
@@ -244,67 +248,66 @@ impl DataCore {
         for path in &mut self.topics {
             path.set_compression(rules.find(&path.name));
         }
-        self.press.rules = rules;
+        self.compress.rules = rules;
     }
 
-    /// Turns to be offered since the last call. Of those of the caller each one is to be taken.
-    pub fn take_turns(&mut self) -> Turns {
-        let press = &mut self.press;
-        let [quick, long] = press.missing();
-        press.asked[Urgency::Quick as usize] += quick;
-        press.asked[Urgency::Long as usize] += long;
-        let is_behind = press.into.waits(Urgency::Quick).bytes > OWN_ABOVE;
-        let own = if is_behind { quick } else { 0 };
-        Turns { quick: quick - own, long, own }
+    /// New requests since the last call. The caller must run all of [`PoolRequests::by_caller`].
+    pub fn take_pool_requests(&mut self) -> PoolRequests {
+        let stage = &mut self.compress;
+        let [quick, long] = stage.missing_requests();
+        stage.requested[Urgency::Quick as usize] += quick;
+        stage.requested[Urgency::Long as usize] += long;
+        let is_behind = stage.into.waits(Urgency::Quick).bytes > OWN_ABOVE;
+        let by_caller = if is_behind { quick } else { 0 };
+        PoolRequests { quick: quick - by_caller, long, by_caller }
     }
 
-    /// Whether there are turns to be offered.
+    /// Whether there are new requests.
     #[must_use]
-    pub fn has_turns(&self) -> bool {
-        self.press.missing().iter().any(|turns| *turns > 0)
+    pub fn has_pool_requests(&self) -> bool {
+        self.compress.missing_requests().iter().any(|requests| *requests > 0)
     }
 
-    /// A thread of the pool has a turn. `None`: nothing is left to be done.
+    /// A pool thread takes the next job. `None`: nothing is left to be done.
     pub fn begin(
         &mut self,
         now: Instant,
         urgency: Urgency,
         link: &mut dyn LaneLink,
-    ) -> Option<PressJob> {
-        self.press.turn_begins(urgency);
+    ) -> Option<CodecJob> {
+        self.compress.request_starts(urgency);
         if urgency == Urgency::Quick
-            && !self.press.was_inward
-            && let Some(job) = self.press.begin_inward()
+            && !self.compress.last_was_inward
+            && let Some(job) = self.compress.begin_inward()
         {
             return Some(job);
         }
-        self.press.was_inward = false;
+        self.compress.last_was_inward = false;
         self.begin_outward(now, urgency, link).or_else(|| match urgency {
-            Urgency::Quick => self.press.begin_inward(),
+            Urgency::Quick => self.compress.begin_inward(),
             Urgency::Long => None,
         })
     }
 
-    /// The calling thread has a turn of its own, for what came over the link. `None`: nothing is
-    /// left to be done.
-    pub fn begin_own(&mut self) -> Option<PressJob> {
-        self.press.turn_begins(Urgency::Quick);
-        self.press.begin_inward()
+    /// The calling thread takes the next inbound job. `None`: nothing is left to be done.
+    pub fn begin_by_caller(&mut self) -> Option<CodecJob> {
+        self.compress.request_starts(Urgency::Quick);
+        self.compress.begin_inward()
     }
 
-    /// Takes what became of a message.
-    pub fn pressed(
+    /// Takes the result of a job.
+    pub fn finished(
         &mut self,
         now: Instant,
-        ticket: PressTicket,
+        ticket: CodecTicket,
         done: Done,
         link: &mut dyn LaneLink,
     ) {
-        self.press.failed += u64::from(done == Done::Failed);
+        self.compress.failed += u64::from(done == Done::Failed);
         if ticket.outward {
-            self.pressed_out(now, &ticket.place, done, link);
+            self.finished_out(now, &ticket.place, done, link);
         } else {
-            self.pressed_in(now, &ticket.place, done, link);
+            self.finished_in(now, &ticket.place, done, link);
         }
         self.stir();
     }
@@ -333,15 +336,15 @@ impl DataCore {
 
     /// What waits for the codec, and what did not get that far.
     #[must_use]
-    pub fn press_counters(&self) -> PressCounters {
-        let press = &self.press;
+    pub fn compress_counters(&self) -> CompressCounters {
+        let stage = &self.compress;
         let waits = Urgency::ALL
-            .map(|urgency| press.out.waits(urgency).bytes + press.into.waits(urgency).bytes);
-        PressCounters {
-            waiting: Urgency::ALL.iter().map(|urgency| press.waiting(*urgency)).sum(),
+            .map(|urgency| stage.out.waits(urgency).bytes + stage.into.waits(urgency).bytes);
+        CompressCounters {
+            waiting: Urgency::ALL.iter().map(|urgency| stage.waiting(*urgency)).sum(),
             waiting_bytes: waits.iter().sum(),
-            refused: press.refused,
-            failed: press.failed,
+            refused: stage.refused,
+            failed: stage.failed,
         }
     }
 }

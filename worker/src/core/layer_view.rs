@@ -1,9 +1,10 @@
-//! The layer's view, as the main service tells it.
+//! The layer's documents in memory, as the main service tells them.
 //!
 //! ```text
 //! connect ─▶ Hello(resume_point) ─▶ Welcome ─┬─ resumed ──────────────────────▶ Commit, Bookmark, … ─▶ disconnected
 //!                                            └─ Snapshot … Snapshot(last) ────▶        │
-//!                                                                                      └─ a fault: Hello with 0
+//!                                                                                      └─ a fault: Hello with revision 0:
+//!                                                                                         asks for a snapshot
 //! ```
 //!
 //! Whatever goes wrong, the documents stay as they were: those that have been served go on being
@@ -64,19 +65,19 @@ enum Stream {
     },
     /// Commits come.
     Live {
-        /// The commit that was told last, or where the stream began.
-        told: u64,
-        /// Until the first commit that is new, older ones may come again; the revision from which
-        /// the stream was resumed.
-        resumed: Option<u64>,
+        /// Revision of the last commit, or where the stream began.
+        last_revision: u64,
+        /// Revision from which the stream was resumed, until the first new commit: older ones may
+        /// come again.
+        resumed_from: Option<u64>,
     },
     /// Nothing sensible comes any more.
     Over,
 }
 
-/// The layer's view at a revision.
+/// The layer's documents in memory, at a revision.
 #[derive(Default)]
-pub struct Replica {
+pub struct LayerView {
     store_id: Option<String>,
     state: State,
     /// When it last knew itself in sync.
@@ -85,13 +86,13 @@ pub struct Replica {
     digest: Option<String>,
     stream: Stream,
     in_sync: bool,
-    /// Where the store stood when the stream began: nobody is in sync before having that.
-    goal: u64,
-    /// The copy cannot be gone on from.
-    is_stale: bool,
+    /// Revision of the store when the stream began; in sync only from there on.
+    sync_target: u64,
+    /// The main service must send a full snapshot; resuming is not possible.
+    needs_snapshot: bool,
 }
 
-impl Replica {
+impl LayerView {
     /// From a copy of a store.
     #[must_use]
     pub fn from_copy(store_id: String, state: State, as_of: Timestamp) -> Self {
@@ -131,7 +132,7 @@ impl Replica {
     /// What the next Hello says.
     pub fn resume_point(&mut self) -> ResumePoint {
         match &self.store_id {
-            Some(store_id) if !self.is_stale => ResumePoint {
+            Some(store_id) if !self.needs_snapshot => ResumePoint {
                 store_id: store_id.clone(),
                 revision: self.state.revision(),
                 digest: self.digest(),
@@ -151,7 +152,7 @@ impl Replica {
     /// Takes a message, told at a time.
     ///
     /// # Errors
-    /// The stream must begin anew, with [`Replica::resume_point`]; the documents stay as they are.
+    /// The stream must begin anew, with [`Self::resume_point`]; the documents stay as they are.
     pub fn apply(&mut self, incoming: Incoming, now: Timestamp) -> Result<Applied, SyncFault> {
         let applied = self.take(incoming);
         match &applied {
@@ -160,7 +161,7 @@ impl Replica {
             Err(fault) => {
                 self.stream = Stream::Over;
                 self.in_sync = false;
-                self.is_stale |= fault.needs_snapshot();
+                self.needs_snapshot |= fault.needs_snapshot();
             }
         }
         applied
@@ -168,7 +169,7 @@ impl Replica {
 
     fn note_sync(&mut self, now: Timestamp) {
         self.in_sync =
-            matches!(self.stream, Stream::Live { .. }) && self.state.revision() >= self.goal;
+            matches!(self.stream, Stream::Live { .. }) && self.state.revision() >= self.sync_target;
         if self.in_sync {
             // A clock that was set back does not make the copy older than it is.
             self.as_of = Some(self.as_of.map_or(now, |before| before.max(now)));
@@ -216,14 +217,14 @@ impl Replica {
         if !(OLDEST_PROTOCOL..=PROTOCOL).contains(&protocol) {
             return Err(SyncFault::Protocol { theirs: protocol });
         }
-        self.goal = revision;
+        self.sync_target = revision;
         let ours = self.state.revision();
         if !resumed {
             self.stream =
                 Stream::Snapshot { store_id, revision: None, documents: Vec::new(), bytes: 0 };
             return Ok(());
         }
-        if self.is_stale || self.store_id.as_ref() != Some(&store_id) || revision < ours {
+        if self.needs_snapshot || self.store_id.as_ref() != Some(&store_id) || revision < ours {
             return Err(SyncFault::OtherStore {
                 store_id: self.store_id.clone(),
                 other: store_id,
@@ -231,7 +232,7 @@ impl Replica {
                 theirs: revision,
             });
         }
-        self.stream = Stream::Live { told: ours, resumed: Some(ours) };
+        self.stream = Stream::Live { last_revision: ours, resumed_from: Some(ours) };
         Ok(())
     }
 
@@ -263,9 +264,9 @@ impl Replica {
         }
         let new = State::new(revision, std::mem::take(documents));
         self.store_id = Some(std::mem::take(store_id));
-        self.stream = Stream::Live { told: revision, resumed: None };
-        self.goal = revision;
-        self.is_stale = false;
+        self.stream = Stream::Live { last_revision: revision, resumed_from: None };
+        self.sync_target = revision;
+        self.needs_snapshot = false;
         let keys = difference(&self.state, &new);
         Ok(self.changed(keys, new))
     }
@@ -276,27 +277,28 @@ impl Replica {
         previous: u64,
         edits: Vec<Edit>,
     ) -> Result<Applied, SyncFault> {
-        let Stream::Live { told, resumed } = &mut self.stream else {
+        let Stream::Live { last_revision, resumed_from } = &mut self.stream else {
             return Err(self.unexpected("Commit"));
         };
-        if let Some(start) = *resumed {
+        if let Some(start) = *resumed_from {
+            // After a resume the server may repeat commits up to `resumed_from`; skip them. The
+            // first new commit may name either the last repeated commit or `resumed_from` as its
+            // predecessor; both are complete.
             if revision <= start {
-                // It was applied before the copy was made. What follows names it as told.
-                *told = revision;
+                *last_revision = revision;
                 return Ok(Applied::Nothing);
             }
-            // Nothing is missing either way: everything up to the start was applied, whatever came
-            // again.
             if previous == start {
-                *told = start;
+                *last_revision = start;
             }
         }
-        if previous != *told {
-            return Err(SyncFault::Gap { expected: *told, got: previous });
+        if previous != *last_revision {
+            return Err(SyncFault::Gap { expected: *last_revision, got: previous });
         }
-        // Also behind a bookmark everything is new: up to it all was told.
-        if revision <= (*told).max(self.state.revision()) {
-            return Err(SyncFault::Gap { expected: *told, got: revision });
+        // A bookmark moves `state.revision()` past the last commit, so a new commit must be above
+        // both.
+        if revision <= (*last_revision).max(self.state.revision()) {
+            return Err(SyncFault::Gap { expected: *last_revision, got: revision });
         }
         let mut new = self.state.clone();
         let mut keys: Vec<Key> = Vec::with_capacity(edits.len());
@@ -316,8 +318,8 @@ impl Replica {
             return Err(SyncFault::TooMany);
         }
         new.advance(revision, []);
-        *told = revision;
-        *resumed = None;
+        *last_revision = revision;
+        *resumed_from = None;
         keys.sort();
         keys.dedup();
         Ok(self.changed(keys, new))
@@ -349,5 +351,5 @@ impl Replica {
 }
 
 #[cfg(test)]
-#[path = "replica_tests.rs"]
+#[path = "layer_view_tests.rs"]
 mod tests;

@@ -28,7 +28,7 @@ fn a_reliable_lane_keeps_all_beside_a_best_effort_one() {
 fn of_large_best_effort_messages_the_newest_wait_and_what_is_begun_stays() {
     let mut hands = Hands::new(vec![lane("cloud/c", false)]);
     hands.publish_all(1, 1..=5, LARGE);
-    assert_eq!((hands.quick, hands.long), (0, 1), "who replaces another has its turn");
+    assert_eq!((hands.quick, hands.long), (0, 1), "who replaces another has its request");
     assert_eq!(hands.dropped(0), [(DropReason::QueueFull, 4)], "at once");
     hands.begin(Urgency::Long);
     hands.publish_all(1, 6..=8, LARGE);
@@ -105,10 +105,10 @@ fn one_topic_neither_fills_the_stage_nor_keeps_the_others_waiting() {
     }
     let begun: Vec<usize> = hands.jobs.iter().map(|job| job.payload.len()).collect();
     assert_eq!(begun, [MIB, LARGE, MIB, LARGE]);
-    let counters = hands.bench.core.press_counters();
+    let counters = hands.bench.core.compress_counters();
     assert_eq!((counters.waiting, counters.waiting_bytes, counters.refused), (6, 6 * MIB, 12));
     hands.run();
-    assert_eq!(hands.bench.core.press_counters().waiting, 0);
+    assert_eq!(hands.bench.core.compress_counters().waiting, 0);
     hands.check();
 }
 
