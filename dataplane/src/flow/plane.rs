@@ -278,7 +278,7 @@ impl Plane {
             let ((), more) = self.locked(|state| state.finished(Instant::now(), ticket, done));
             requests += more;
         }
-        turns
+        requests
     }
 
     /// Passes requests to the pool, and runs those for the caller. Called without the lock.
