@@ -12,6 +12,12 @@
 
 #[path = "../../dataplane/src/codec/lz4/image.rs"]
 mod image;
+#[allow(dead_code, clippy::unwrap_used, reason = "made for tests, which use the rest")]
+#[path = "../../dataplane/src/testing/random.rs"]
+mod random;
+mod testing {
+    pub(crate) use crate::random::Random;
+}
 
 use std::path::Path;
 use std::time::Duration;

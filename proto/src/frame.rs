@@ -34,12 +34,14 @@ pub const MAGIC: [u8; 4] = *b"BLZ1";
 /// Magic and header length.
 pub const PREFIX_BYTES: usize = 8;
 /// Largest frame.
-pub const MAX_FRAME_BYTES: usize = PREFIX_BYTES + MAX_HEADER_BYTES + MAX_PAYLOAD_BYTES;
+pub const MAX_FRAME_BYTES: usize = PREFIX_BYTES + LONGEST_HEADER_BYTES + MAX_PAYLOAD_BYTES;
 
 const HOPS_TAG: u32 = 12;
 const AGE_TAG: u32 = 13;
 /// Hops and age need at most 17 bytes: two keys of one byte, numbers of up to 5 and 10 bytes.
 const HOPS_AND_AGE_BYTES: usize = 17;
+/// Hops and age grow on the way, so they do not count.
+const LONGEST_HEADER_BYTES: usize = MAX_HEADER_BYTES + HOPS_AND_AGE_BYTES;
 
 /// Why bytes that claim to be a frame are none.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -134,14 +136,13 @@ impl Frame {
             return Err(FrameError::Truncated { found: bytes.len(), needed: PREFIX_BYTES });
         };
         let length = u32::from_le_bytes([length[0], length[1], length[2], length[3]]) as usize;
-        if length > MAX_HEADER_BYTES {
+        if length > LONGEST_HEADER_BYTES {
             return Err(FrameError::HeaderTooLarge(length));
         }
         Ok(PREFIX_BYTES + length)
     }
 
-    /// A frame from its encoded prefix and header, and its payload, which may lie elsewhere. The
-    /// header must leave room for the longest hops and age: they grow on the way.
+    /// A frame from its encoded prefix and header, and its payload, which may lie elsewhere.
     ///
     /// # Errors
     /// What is wrong with it, see [`FrameError`].
@@ -154,10 +155,9 @@ impl Frame {
             return Err(FrameError::PayloadTooLarge(payload.len()));
         }
         let index = Index::read(&head[PREFIX_BYTES..])?;
-        let longest =
-            needed - PREFIX_BYTES - index.hops_at.len() - index.age_at.len() + HOPS_AND_AGE_BYTES;
-        if longest > MAX_HEADER_BYTES {
-            return Err(FrameError::HeaderTooLarge(longest));
+        let lasting = needed - PREFIX_BYTES - index.hops_at.len() - index.age_at.len();
+        if lasting > MAX_HEADER_BYTES {
+            return Err(FrameError::HeaderTooLarge(lasting));
         }
         let (hops, age_us) = (index.encoded_hops, index.encoded_age_us);
         Ok(Self { head, payload, index, hops, age_us })
@@ -205,7 +205,7 @@ impl Frame {
             encode_key(AGE_TAG, WireType::Varint, &mut out);
             encode_varint(self.age_us, &mut out);
         }
-        // At most `MAX_HEADER_BYTES`, as `from_parts` has checked: this never fails.
+        // At most `LONGEST_HEADER_BYTES`, as `from_parts` has checked: this never fails.
         let length = u32::try_from(out.len() - PREFIX_BYTES).unwrap_or(u32::MAX);
         out[4..PREFIX_BYTES].copy_from_slice(&length.to_le_bytes());
         out.freeze()

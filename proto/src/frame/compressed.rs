@@ -11,14 +11,14 @@
 
 use std::ops::Range;
 
-use blaze_domain::{MAX_HEADER_BYTES, MAX_PAYLOAD_BYTES};
+use blaze_domain::MAX_PAYLOAD_BYTES;
 use bytes::{BufMut, Bytes, BytesMut};
 use prost::encoding::{
     DecodeContext, WireType, decode_key, encode_key, encode_varint, encoded_len_varint, key_len,
     skip_field,
 };
 
-use super::{Frame, FrameError, MAGIC, PREFIX_BYTES};
+use super::{Frame, FrameError, LONGEST_HEADER_BYTES, MAGIC, PREFIX_BYTES};
 
 #[cfg(test)]
 mod tests;
@@ -132,7 +132,7 @@ impl Frame {
 fn begin(header_bytes: usize) -> Result<BytesMut, FrameError> {
     let length =
         u32::try_from(header_bytes).map_err(|_| FrameError::HeaderTooLarge(header_bytes))?;
-    if header_bytes > MAX_HEADER_BYTES {
+    if header_bytes > LONGEST_HEADER_BYTES {
         return Err(FrameError::HeaderTooLarge(header_bytes));
     }
     let mut head = BytesMut::with_capacity(PREFIX_BYTES + header_bytes);

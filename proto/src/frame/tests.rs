@@ -61,14 +61,14 @@ fn hops_and_age_are_written_anew_and_the_rest_stays() {
 }
 
 #[test]
-fn a_header_leaves_room_for_hops_and_age() {
+fn hops_and_age_grow_beyond_the_longest_header() {
     let of =
         |length: usize| Header { traceparent: "t".repeat(length), hops: 0, age_us: 0, ..header() };
     let short = Frame::new(&of(3_000), Bytes::new()).unwrap().head().len() - PREFIX_BYTES;
-    let longest = 3_000 + MAX_HEADER_BYTES - HOPS_AND_AGE_BYTES - short;
+    let longest = 3_000 + MAX_HEADER_BYTES - short;
     let frame = Frame::new(&of(longest), Bytes::new()).unwrap();
     let written = frame.with_hops_and_age(u32::MAX, u64::MAX).to_bytes();
-    assert_eq!(written.len(), PREFIX_BYTES + MAX_HEADER_BYTES);
+    assert_eq!(written.len(), PREFIX_BYTES + MAX_HEADER_BYTES + HOPS_AND_AGE_BYTES);
     let again = Frame::parse(written).unwrap();
     assert_eq!((again.hops(), again.age_us()), (u32::MAX, u64::MAX));
     assert_eq!(

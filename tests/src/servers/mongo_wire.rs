@@ -12,7 +12,7 @@ use bson::{Document, doc};
 
 use super::endpoint::Endpoint;
 
-const TIMEOUT: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(10);
 const OP_MSG: i32 = 2013;
 /// The most that an answer may hold.
 const MAX_ANSWER: usize = 4 << 20;
@@ -21,7 +21,7 @@ const ALREADY_INITIALIZED: i32 = 23;
 /// Process that answers.
 ///
 /// # Errors
-/// When there is no answer within two seconds, or one that is not MongoDB's.
+/// When there is no answer within ten seconds, or one that is not MongoDB's.
 pub(super) fn pid(server: &Endpoint) -> anyhow::Result<i64> {
     let answer =
         command(server, &doc! { "serverStatus": 1, "repl": 0, "metrics": 0, "$db": "admin" })?;

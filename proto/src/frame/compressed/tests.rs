@@ -2,8 +2,7 @@
 
 use super::*;
 use crate::Header;
-use crate::frame::HOPS_AND_AGE_BYTES;
-use blaze_domain::{Origin, Priority, WriterId};
+use blaze_domain::{MAX_HEADER_BYTES, Origin, Priority, WriterId};
 use proptest::prelude::*;
 
 fn header() -> Header {
@@ -91,7 +90,7 @@ fn a_header_without_room_is_an_error() {
     for (free, size, fits) in
         [(4, 127, true), (4, 128, false), (7, MAX_PAYLOAD_BYTES as u64, true), (0, 0, false)]
     {
-        let original = with_header_bytes(MAX_HEADER_BYTES - HOPS_AND_AGE_BYTES - free);
+        let original = with_header_bytes(MAX_HEADER_BYTES - free);
         let packed = original.compressed(Bytes::from_static(b"p"), size);
         assert_eq!(packed.is_ok(), fits, "{free} bytes free, size {size}: {packed:?}");
         match packed {
