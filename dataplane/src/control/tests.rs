@@ -242,6 +242,20 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
 }
 
 #[test]
+fn changes_without_end_hold_up_no_plan_for_longer_than_the_latest_time() {
+    let mut bench = Bench::ready();
+    bench.send(Scope::Node, &lease("advertise", "t"));
+    let pause = QUIET / 2;
+    for number in 0..=LATEST.as_millis() / pause.as_millis() {
+        let mut request = lease("request", "t");
+        request["service"] = json!(format!("s{number}"));
+        bench.send(Scope::Layer, &request);
+        bench.step(pause.as_millis() as u64);
+    }
+    assert_eq!(bench.bridges("t"), ["node>Layer"]);
+}
+
+#[test]
 fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
     let mut bench = Bench::ready();
     bench.outputs.clear();

@@ -142,17 +142,36 @@ async fn a_bound_token_is_told_of_its_layer_alone() {
     );
 }
 
+/// Why a quiet stream ended, within five seconds: before it would look by itself.
+async fn end(stream: &mut crate::core::WatchStream) -> Problem {
+    let wait = async {
+        loop {
+            match stream.next().await {
+                Some(WatchItem::End(problem)) => return *problem.unwrap(),
+                Some(_) => {}
+                None => panic!("it ends without a word"),
+            }
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(5), wait).await.expect("an end within 5 s")
+}
+
 #[tokio::test]
 async fn a_watch_ends_with_its_reason_when_the_service_ends() {
     let w = world().await;
     let mut stream = w.service.watch(&w.admin, &WatchQuery::default()).await.unwrap().value;
     w.service.end_watches();
-    let problem = loop {
-        match tokio::time::timeout(Duration::from_secs(10), stream.next()).await.unwrap() {
-            Some(WatchItem::End(problem)) => break problem.unwrap(),
-            Some(_) => {}
-            None => panic!("it ends without a word"),
-        }
-    };
-    assert_eq!(problem.code, Code::ShuttingDown);
+    assert_eq!(end(&mut stream).await.code, Code::ShuttingDown);
+}
+
+#[tokio::test]
+async fn a_quiet_watch_ends_when_its_token_runs_out() {
+    let w = world().await;
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+    let expires_s = Some(now.as_secs() as i64 + 2);
+    let claims = Claims { expires_s, ..(*w.admin.claims).clone() };
+    let caller = Caller { claims: Arc::new(claims), ..w.admin.clone() };
+    let mut stream = w.service.watch(&caller, &WatchQuery::default()).await.unwrap().value;
+    assert!(matches!(stream.next().await, Some(WatchItem::Bookmark(_))), "it is open");
+    assert_eq!(end(&mut stream).await.code, Code::Unauthenticated);
 }
