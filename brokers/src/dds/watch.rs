@@ -60,10 +60,15 @@ pub struct Endpoints {
 /// Participants that were lost and are remembered, to know them again.
 const MAX_LOST: usize = 1024;
 
+/// Least time between two participants of which the first ends because of others: who comes and
+/// goes all the time must not keep this one from working.
+const LIFE: Duration = Duration::from_secs(10);
+
 /// Watches all endpoints until it is dropped.
 pub struct EndpointWatch {
     _thread: StoppableThread,
     returned: Arc<AtomicBool>,
+    started: Instant,
 }
 
 impl EndpointWatch {
@@ -79,14 +84,15 @@ impl EndpointWatch {
         let thread = StoppableThread::start("dds-watch", failed, move |stop| {
             watch(&participant, stop, &tell, || sink(endpoints(&participant, own, topics)));
         })?;
-        Ok(Self { _thread: thread, returned })
+        Ok(Self { _thread: thread, returned, started: Instant::now() })
     }
 
     /// Whether a participant came back that was lost before. RustDDS does not ask it for its
-    /// readers and writers again, so that this one must begin anew to meet it.
+    /// readers and writers again, so that this one must begin anew to meet it: not in its first ten
+    /// seconds.
     #[must_use]
     pub fn has_returned(&self) -> bool {
-        self.returned.load(Ordering::Relaxed)
+        self.returned.load(Ordering::Relaxed) && self.started.elapsed() > LIFE
     }
 }
 

@@ -37,6 +37,18 @@ struct Seen {
     uuid: Option<TopicUuid>,
 }
 
+impl Seen {
+    /// Takes what was seen now; `uuid` is absent if it could not be asked for. Whether the topic
+    /// was made since the last time, and is empty.
+    fn is_new_at(&mut self, is_there: bool, uuid: Option<TopicUuid>) -> bool {
+        let before = std::mem::take(self);
+        let is_another =
+            matches!((&before.uuid, &uuid), (Some(before), Some(now)) if before != now);
+        *self = Self { is_there, uuid: uuid.or(before.uuid).filter(|_| is_there) };
+        is_there && (!before.is_there || is_another)
+    }
+}
+
 /// The flow's part of a broker.
 pub(super) struct FlowState {
     pub(super) creator: TopicCreator,
@@ -70,10 +82,7 @@ impl FlowState {
         let known = || inner.directory.known_identity(name);
         let ask = || inner.directory.topic(name, Duration::from_secs(1)).ok()?.uuid;
         let uuid = if is_there { known().or_else(ask) } else { None };
-        let before =
-            std::mem::replace(&mut *self.leases_seen.lock(), Seen { is_there, uuid: uuid.clone() });
-        let is_another = matches!((before.uuid, uuid), (Some(before), Some(now)) if before != now);
-        if is_there && (!before.is_there || is_another) {
+        if self.leases_seen.lock().is_new_at(is_there, uuid) {
             self.write_all_leases();
         }
     }
@@ -185,5 +194,27 @@ impl FlowSide for KafkaFlowSide {
             return;
         }
         self.inner.stand_back(back);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_topic_is_new_when_it_comes_and_when_it_is_another_one() {
+        let of = |octet: &str| TopicUuid::from_base64(&octet.repeat(22));
+        let (one, other) = (|| of("B"), || of("C"));
+        let mut seen = Seen::default();
+        assert!(!seen.is_new_at(false, None));
+        assert!(seen.is_new_at(true, one()));
+        assert!(!seen.is_new_at(true, one()));
+        // It was deleted and made again between two looks, of which one could not ask.
+        assert!(!seen.is_new_at(true, None));
+        assert!(seen.is_new_at(true, other()));
+        assert!(!seen.is_new_at(true, other()));
+        assert!(!seen.is_new_at(false, None));
+        assert!(seen.is_new_at(true, None), "whatever it is");
+        assert!(!seen.is_new_at(true, one()), "known for the first time");
     }
 }

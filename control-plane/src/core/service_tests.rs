@@ -1,5 +1,6 @@
 //! The core from outside, on a store in memory.
 
+mod behind;
 mod failed;
 mod once;
 mod pages;
@@ -333,7 +334,7 @@ async fn pruning_needs_confirmation_beyond_twenty() {
 }
 
 /// A world on a store that may hold something, with these keys.
-async fn world_on(store: &Arc<SqliteStore>, keys: &[(&str, [u8; 32])]) -> World {
+async fn world_on<S: Store>(store: &Arc<S>, keys: &[(&str, [u8; 32])]) -> World {
     let supervisor = Supervisor::new("test");
     let store = Arc::clone(store) as Arc<dyn Store>;
     World {

@@ -262,6 +262,24 @@ impl Served {
         notices
     }
 
+    /// Takes an instance that runs with a configuration of this layer and is not known here: it may
+    /// have asked another life, or another worker, that was killed before it noted so. A notice, in
+    /// any case: what the instance says of its configuration may be older than what it has.
+    pub fn meet(&mut self, place: &ServedTarget, now: Instant) -> Option<Notice> {
+        if !self.is_ready() {
+            return None;
+        }
+        if self.places.get(place).is_some() {
+            if self.asked.contains(place) {
+                self.note_asked(place, now);
+            }
+            return None;
+        }
+        let standing = self.ask(place, now)?;
+        let new = (self.shown.at(&self.site, place)?, standing.hash);
+        Some(self.notice(place, standing.revision, None, None, Some(new)))
+    }
+
     /// Takes over what another life, or another worker, knew: places that it notified, and the
     /// revision up to which it did. The places count as if they had asked now, because they may
     /// well be running.

@@ -8,7 +8,7 @@ use tokio::time::Instant;
 
 use super::{ACK_AFTER, ACK_PACE, Engine, LOOK};
 use crate::core::messages::{ConfigAck, ServiceState, WatchdogKey};
-use crate::core::{Complaint, RolloutState};
+use crate::core::{Complaint, RolloutState, ServedTarget};
 
 /// Something that was heard of services.
 #[derive(Debug)]
@@ -42,6 +42,7 @@ impl Engine {
             Sign::Beat(bytes) => match ServiceState::parse(&bytes) {
                 Ok(state) => {
                     self.counts.signs += 1;
+                    self.meet(&state);
                     self.signs.beat(state, now).into_iter().collect()
                 }
                 Err(error) => self.misunderstood(&error),
@@ -57,6 +58,7 @@ impl Engine {
                     }
                 }
                 self.counts.signs += states.len() as u64;
+                states.iter().for_each(|state| self.meet(state));
                 self.signs.scanned(states, is_whole, now)
             }
             Sign::Deaf => {
@@ -65,6 +67,29 @@ impl Engine {
             }
         };
         self.judge(&complaints);
+    }
+
+    /// An instance that runs with a configuration is told of changes, whoever gave it that one.
+    /// Workers know it by themselves.
+    fn meet(&mut self, state: &ServiceState) {
+        let site = &self.identity.site;
+        let is_elsewhere = state.layer.as_ref().is_some_and(|layer| *layer != site.layer)
+            || site.node.as_ref().is_some_and(|node| *node != state.key.node);
+        let own = self.outputs.own.as_ref();
+        let is_worker = own.is_some_and(|own| own.place.service == state.key.service);
+        if state.config_hash.is_empty() || is_elsewhere || is_worker {
+            return;
+        }
+        let WatchdogKey { service, node, instance } = state.key.clone();
+        let place = ServedTarget { service, instance: Some(instance), node: Some(node) };
+        let now = Instant::now().into_std();
+        let notice = self.served.meet(&place, now);
+        if self.notes_version != self.served.places_version() {
+            self.owe_notes();
+            self.settle_soon();
+        }
+        let told = notice.and_then(|notice| self.of_notice(&notice));
+        self.tell(told.into_iter().collect());
     }
 
     fn misunderstood(&mut self, error: &str) -> Vec<Complaint> {

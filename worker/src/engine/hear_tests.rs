@@ -90,6 +90,38 @@ impl World {
 }
 
 #[tokio::test(start_paused = true)]
+async fn an_instance_that_asked_a_life_before_is_told_of_what_it_does_not_have() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    let rates_of_9 = async |w: &mut World| {
+        let seen = w.rest().await;
+        let of_9 = noticed(&seen).filter(|(_, notice)| notice["instance"] == "9");
+        of_9.map(|(_, notice)| notice["config"]["rate_hz"].clone()).collect::<Vec<_>>()
+    };
+    // It has no document, and nobody noted that it asked.
+    w.beats(&beat("9", "ready")).await;
+    assert_eq!(rates_of_9(&mut w).await, [json!(30)]);
+    w.beats(&beat("9", "ready")).await;
+    assert_eq!(rates_of_9(&mut w).await, [json!(null); 0], "it is told once");
+    w.says(slam(3, 31)).await;
+    let seen = w.rest().await;
+    let (_, told) = noticed(&seen).find(|(_, notice)| notice["instance"] == "9").unwrap();
+    assert_eq!(told["config"]["rate_hz"], 31);
+    // What it says may be older than what it has, and look right by chance.
+    let mut old = beat("8", "ready");
+    old["config_hash"] = told["hash"].clone();
+    w.beats(&old).await;
+    let seen = w.rest().await;
+    assert!(noticed(&seen).any(|(_, notice)| notice["instance"] == "8"));
+    // One that runs without a configuration of ours wants none.
+    let mut other = beat("10", "ready");
+    other["config_hash"] = json!("");
+    w.beats(&other).await;
+    assert!(noticed(&w.rest().await).next().is_none());
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_bad_value_is_undone_without_the_main_service_and_stays_away_after_a_restart() {
     let (_supervisor, fake, copies) = copies();
     let mut w = world_with(None, true, Some(copies.clone())).with_canary().await;

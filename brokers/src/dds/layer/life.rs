@@ -22,8 +22,6 @@ const RETRY: Duration = Duration::from_secs(1);
 const GOOD_BYE: Duration = Duration::from_secs(1);
 /// How often it is looked whether the interface still has its address.
 const INTERFACE: Duration = Duration::from_secs(1);
-/// Between two lives that end because of others.
-const LIFE: Duration = Duration::from_secs(10);
 /// After standing still for so long this participant may have been forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(20);
 /// A window that is full for a moment is the network's pace.
@@ -103,7 +101,7 @@ impl Lifecycle {
             Some("others had given this participant up")
         } else if paused > FORGOTTEN {
             Some("this process stood still for long")
-        } else if generation.has_missed_one() && age > LIFE {
+        } else if generation.has_missed_one() {
             Some("a participant came back after it was lost")
         } else {
             None

@@ -193,13 +193,10 @@ impl Slots {
     /// Takes out the writers whose time is over.
     pub(super) fn take_gone(&self, now: Instant) -> Vec<Arc<Writer>> {
         let mut retired = self.retired.0.lock();
-        let is_gone = |writer: &Writer, at: Instant| {
-            let passed = now.saturating_duration_since(at);
-            passed >= LONGEST_LINGER || (passed >= LINGER && writer.is_acknowledged())
-        };
-        let (gone, stays): (Vec<_>, Vec<_>) = std::mem::take(&mut *retired)
-            .into_iter()
-            .partition(|(writer, at)| is_gone(writer, *at));
+        let (gone, stays): (Vec<_>, Vec<_>) =
+            std::mem::take(&mut *retired).into_iter().partition(|(writer, at)| {
+                may_go(now.saturating_duration_since(*at), || writer.is_acknowledged())
+            });
         *retired = stays;
         gone.into_iter().map(|(writer, _)| writer).collect()
     }
@@ -211,5 +208,25 @@ impl Slots {
             live.iter().filter_map(|slot| std::mem::take(&mut *slot.state.lock()).writer).collect();
         writers.extend(self.retired.0.lock().drain(..).map(|(writer, _)| writer));
         writers
+    }
+}
+
+/// Whether a writer without users may go, this long after the last one.
+fn may_go(passed: Duration, is_acknowledged: impl FnOnce() -> bool) -> bool {
+    passed >= LONGEST_LINGER || (passed >= LINGER && is_acknowledged())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_writer_waits_for_readers_but_not_for_ever() {
+        let before = |limit: Duration| limit - Duration::from_millis(1);
+        assert!(!may_go(before(LINGER), || true), "it may be wanted again at once");
+        assert!(may_go(LINGER, || true));
+        assert!(!may_go(LINGER, || false), "what a reader lacks is still repaired");
+        assert!(!may_go(before(LONGEST_LINGER), || false));
+        assert!(may_go(LONGEST_LINGER, || false));
     }
 }

@@ -25,8 +25,6 @@ const LIVE: Duration = Duration::from_millis(1200);
 const GOOD_BYE: Duration = Duration::from_secs(1);
 const RETRY: Duration = Duration::from_secs(1);
 const COUNT: Duration = Duration::from_secs(1);
-/// Least time between two lives that end because of others.
-const LIFE: Duration = Duration::from_secs(10);
 
 pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
     thread::Builder::new()
@@ -89,10 +87,9 @@ impl Lifecycle {
 
     fn tick(&mut self) {
         let now = Instant::now();
-        let age = now.saturating_duration_since(self.built);
         if let Some(illness) = self.generation.as_mut().and_then(Generation::illness) {
             self.bury(&illness.to_string());
-        } else if age > LIFE && self.generation.as_ref().is_some_and(Generation::has_missed_one) {
+        } else if self.generation.as_ref().is_some_and(Generation::has_missed_one) {
             self.bury("a participant came back after it was lost");
         }
         if self.generation.is_none() && now >= self.next_attempt {
