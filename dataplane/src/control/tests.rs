@@ -248,7 +248,7 @@ fn changes_without_end_hold_up_no_plan_for_longer_than_the_latest_time() {
     let pause = QUIET / 2;
     for number in 0..=LATEST.as_millis() / pause.as_millis() {
         let mut request = lease("request", "t");
-        request["service"] = json!(format!("s{number}"));
+        request["max_rate_hz"] = json!(number + 1);
         bench.send(Scope::Layer, &request);
         bench.step(pause.as_millis() as u64);
     }
