@@ -14,10 +14,7 @@ impl Engine {
         let (to, text) = match GetRequest::parse(request) {
             Ok(request) => {
                 let reply = self.reply_to(&request);
-                if self.notes_version != self.served.places_version() {
-                    self.owe_notes();
-                    self.settle_soon();
-                }
+                self.note_new_places();
                 if self.served.has_pending() {
                     self.flush_soon();
                 }

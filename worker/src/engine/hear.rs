@@ -84,12 +84,12 @@ impl Engine {
         let place = ServedTarget { service, instance: Some(instance), node: Some(node) };
         let now = Instant::now().into_std();
         let notice = self.served.meet(&place, now);
-        if self.notes_version != self.served.places_version() {
-            self.owe_notes();
-            self.settle_soon();
+        self.note_new_places();
+        // Another replica tells it, where that one leads.
+        if let Some(notice) = notice.filter(|_| self.tells) {
+            let told = self.of_notice(&notice);
+            self.tell(told.into_iter().collect());
         }
-        let told = notice.and_then(|notice| self.of_notice(&notice));
-        self.tell(told.into_iter().collect());
     }
 
     fn misunderstood(&mut self, error: &str) -> Vec<Complaint> {

@@ -306,6 +306,14 @@ impl Engine {
         });
     }
 
+    /// Has a place kept soon that was not known before.
+    fn note_new_places(&mut self) {
+        if self.notes_version != self.served.places_version() {
+            self.owe_notes();
+            self.settle_soon();
+        }
+    }
+
     /// Copies without what is still to come do not count as current.
     fn owe_notes(&self) {
         if let Some(copies) = &self.outputs.copies {

@@ -200,7 +200,7 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
     let watchers = 2 * count(100, 5);
     let limit = Duration::from_secs(if long { 600 } else { 60 });
     let (stands, pause) = match long {
-        true => (Duration::from_secs(60), Duration::from_millis(40)),
+        true => (Duration::from_secs(60), Duration::from_millis(60)),
         false => (Duration::ZERO, Duration::from_millis(1)),
     };
     let mut writers: Vec<Writer> =
