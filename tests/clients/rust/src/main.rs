@@ -189,12 +189,10 @@ async fn replaced(client: &Client) -> anyhow::Result<()> {
 }
 
 async fn patched(client: &Client) -> anyhow::Result<()> {
-    let patch: types::DocumentPatch = body(
-        json!({
-            "labels": { "site": "lab" },
-            "spec": { "config": { "camera": { "rate_hz": 20 } } },
-        }),
-    )?;
+    let patch: types::DocumentPatch = body(json!({
+        "labels": { "site": "lab" },
+        "spec": { "config": { "camera": { "rate_hz": 20 } } },
+    }))?;
     let service =
         given(client.patch_service().name("slam").if_match("*").body(patch).send().await).await?;
     let config = service.spec.config.as_ref().context("no config")?;
