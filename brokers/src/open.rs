@@ -82,7 +82,7 @@ fn dds_error(error: &DdsError) -> OpenError {
     let key = match error {
         DdsError::Domain(_) => "dds.domain",
         DdsError::Address(_) | DdsError::AddressMissing { .. } => "dds.interface",
-        DdsError::Create { .. } | DdsError::Panicked(_) => "dds",
+        DdsError::Create { .. } | DdsError::Panicked(_) | DdsError::Hangs(_) => "dds",
     };
     OpenError::Setting { key: key.to_owned(), reason: error.to_string() }
 }

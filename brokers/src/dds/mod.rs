@@ -87,6 +87,9 @@ pub enum DdsError {
     /// A panic inside RustDDS.
     #[error("RustDDS failed while making a {0}")]
     Panicked(&'static str),
+    /// RustDDS stands still: the participant must be replaced.
+    #[error("RustDDS stands still while making a {0}")]
+    Hangs(&'static str),
 }
 
 /// Whether participants of a domain can be on the interface with an address, as far as that shows

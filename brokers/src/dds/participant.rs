@@ -5,6 +5,8 @@ use std::net::{IpAddr, Ipv4Addr, UdpSocket};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, sync_channel};
+use std::{thread, time};
 
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
@@ -18,7 +20,10 @@ use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
 use super::watch::{EndpointWatch, Endpoints};
 use super::writer::{Writer, endpoint_of, participant_of};
-use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, multicast_port};
+use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, create_error, multicast_port};
+
+/// RustDDS hangs when it takes longer to make an endpoint; else it takes some milliseconds.
+const HANG: time::Duration = time::Duration::from_secs(2);
 
 /// Identity of one participant on the wire; a rebuilt one has a new identity.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -225,10 +230,9 @@ impl Participant {
     /// # Errors
     /// [`DdsError`] when RustDDS refuses or has died.
     pub fn writer(&self, topic: &str, profile: Profile) -> Result<Writer, DdsError> {
-        let writer = self.contain("writer", || {
-            let topic = self.topic(topic, profile)?;
-            self.publisher
-                .create_datawriter_no_key::<Octets, OctetsAdapter>(&topic, Some(profile.qos()))
+        let publisher = self.publisher.clone();
+        let writer = self.make("writer", topic, profile, move |topic| {
+            publisher.create_datawriter_no_key::<Octets, OctetsAdapter>(topic, Some(profile.qos()))
         })?;
         Ok(Writer::new(writer, profile.transient_local, Arc::clone(&self.failed)))
     }
@@ -259,8 +263,9 @@ impl Participant {
         EndpointWatch::start(self.dds.clone(), self.prefix, topics, sink, Arc::clone(&self.failed))
     }
 
-    /// Whether its threads are alive, as far as that shows without traffic: a panic anywhere was
-    /// seen, the event loop holds its port, the discovery thread takes commands.
+    /// Whether its threads are alive, as far as that shows without traffic: no panic was seen, no
+    /// endpoint took too long to make, the event loop holds its port, the discovery thread takes
+    /// commands.
     #[must_use]
     pub fn is_alive(&self) -> bool {
         if self.failed.load(Ordering::Relaxed) {
@@ -286,31 +291,47 @@ impl Participant {
         name: &str,
         profile: Profile,
     ) -> Result<no_key::SimpleDataReader<Octets, OctetsAdapter>, DdsError> {
-        self.contain("reader", || {
-            let topic = self.topic(name, profile)?;
-            self.subscriber.create_simple_datareader_no_key::<Octets, OctetsAdapter>(
-                &topic,
+        let subscriber = self.subscriber.clone();
+        self.make("reader", name, profile, move |topic| {
+            subscriber.create_simple_datareader_no_key::<Octets, OctetsAdapter>(
+                topic,
                 Some(profile.qos()),
             )
         })
     }
 
-    fn topic(&self, name: &str, profile: Profile) -> rustdds::dds::CreateResult<Topic> {
-        self.dds.create_topic(
-            name.to_owned(),
-            FRAME_TYPE.to_owned(),
-            &profile.qos(),
-            TopicKind::NoKey,
-        )
-    }
-
-    fn contain<T>(
+    /// Makes an endpoint, in a thread of its own that can be left behind.
+    ///
+    /// RustDDS 0.15 can stand still for good here: its discovery holds the table of endpoints while
+    /// it tells the event loop of those on the topic of a new one, for which there is room for 32;
+    /// when the next endpoint waits for the table, the event loop does not get at it either, and
+    /// takes nothing any more.
+    fn make<T: Send + 'static>(
         &self,
         what: &'static str,
-        make: impl FnOnce() -> rustdds::dds::CreateResult<T>,
+        name: &str,
+        profile: Profile,
+        make: impl FnOnce(&Topic) -> rustdds::dds::CreateResult<T> + Send + 'static,
     ) -> Result<T, DdsError> {
-        contain(what, make).inspect_err(|error| {
-            if matches!(error, DdsError::Panicked(_)) {
+        let (dds, name) = (self.dds.clone(), name.to_owned());
+        let (tell, made) = sync_channel(1);
+        let making = move || {
+            let made = contain(what, || {
+                let kind = FRAME_TYPE.to_owned();
+                make(&dds.create_topic(name, kind, &profile.qos(), TopicKind::NoKey)?)
+            });
+            // One that nobody waits for any more is dropped.
+            let _ = tell.send(made);
+        };
+        let thread = thread::Builder::new().name("dds-make".to_owned());
+        thread.spawn(making).map_err(create_error("thread"))?;
+        let made = match made.recv_timeout(HANG) {
+            Ok(made) => made,
+            Err(RecvTimeoutError::Timeout) => Err(DdsError::Hangs(what)),
+            Err(RecvTimeoutError::Disconnected) => Err(DdsError::Panicked(what)),
+        };
+        made.inspect_err(|error| {
+            if matches!(error, DdsError::Panicked(_) | DdsError::Hangs(_)) {
                 self.failed.store(true, Ordering::Relaxed);
             }
         })

@@ -27,8 +27,8 @@ const CLOCK_STEP: Duration = Duration::from_millis(500);
 /// Why a participant must be replaced.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Illness {
-    /// A thread of RustDDS or of a reader has ended.
-    #[error("a thread of RustDDS ended")]
+    /// A thread of RustDDS or of a reader has ended, or stands still.
+    #[error("a thread of RustDDS ended or stands still")]
     ThreadEnded,
     /// The event loop does not answer.
     #[error("the event loop of RustDDS hangs")]

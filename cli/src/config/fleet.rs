@@ -207,7 +207,8 @@ mod tests {
     #[test]
     fn times_are_absolute_or_ago() {
         assert_eq!(parse_time("2026-11-21T07:01:12.345Z").unwrap(), Timestamp::from_millis(NOW));
-        let ago = now_ms() - parse_time("1h").unwrap().as_millis();
+        let hour_ago = parse_time("1h").unwrap().as_millis();
+        let ago = now_ms() - hour_ago;
         assert!((3_600_000..3_610_000).contains(&ago), "{ago}");
         assert!(parse_time("yesterday").unwrap_err().contains("24h"));
     }

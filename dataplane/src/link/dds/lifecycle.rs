@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
     DdsError, EndpointWatch, FoundReader, GuidPrefix, Illness, Participant, ParticipantConfig,
-    Pulse, Reader, lay_aside,
+    Pulse, Reader, Writer, lay_aside,
 };
 use blaze_domain::Priority;
 
@@ -24,6 +24,8 @@ const TICK: Duration = Duration::from_millis(200);
 const LIVE: Duration = Duration::from_millis(1200);
 const GOOD_BYE: Duration = Duration::from_secs(1);
 const RETRY: Duration = Duration::from_secs(1);
+/// How long a new writer is waited for at most; RustDDS matches it within some milliseconds.
+const MATCH: Duration = Duration::from_millis(100);
 const COUNT: Duration = Duration::from_secs(1);
 
 pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
@@ -207,6 +209,7 @@ impl Lifecycle {
             let room = profile(class, self.shared.wire.max_datagram_bytes());
             match generation.participant.writer(&topic(&endpoint, class), room) {
                 Ok(writer) => {
+                    wait_matched(&writer);
                     // It may have been disconnected meanwhile.
                     let wanted = self.shared.wanted.lock();
                     if wanted.get(&endpoint).is_some_and(|flags| flags[class as usize]) {
@@ -278,6 +281,15 @@ impl Generation {
             return Some(Illness::ThreadEnded);
         }
         self.pulse.feel(&self.participant).err()
+    }
+}
+
+/// Waits for the reader of the other endpoint, which is known by now: RustDDS may hang when it is
+/// asked for the next writer while it still matches this one.
+fn wait_matched(writer: &Writer) {
+    let until = Instant::now() + MATCH;
+    while !writer.is_matched() && Instant::now() < until {
+        thread::sleep(Duration::from_millis(1));
     }
 }
 

@@ -3,8 +3,8 @@
 use std::net::Ipv4Addr;
 use std::time::Duration;
 
-use blaze_brokers::dds::Fault;
 use blaze_brokers::dds::layer::DdsBroker;
+use blaze_brokers::dds::{DdsError, Fault, Participant, ParticipantConfig, Profile};
 use blaze_brokers::{
     Broker, BrokerError, Content, Health, PublishOutcome, PublisherOptions, Received,
     SubscribeOptions,
@@ -40,6 +40,28 @@ fn addresses_that_are_no_interface_are_refused() {
     }
     let interface = Ipv4Addr::LOCALHOST;
     assert!(DdsBroker::open(&Section { domain: 101, interface }).is_err());
+}
+
+/// There is room for ten writers that the event loop did not take yet: one more waits for it.
+#[test]
+fn a_writer_that_cannot_be_made_holds_nobody_up() {
+    let domain = Domain::start();
+    let config = ParticipantConfig::new(domain.id, Ipv4Addr::LOCALHOST);
+    let participant = Participant::start(config).unwrap();
+    participant.inject(Fault::Hang).unwrap();
+    assert!(participant.is_alive());
+    let mut made = Vec::new();
+    let refused = loop {
+        assert!(made.len() < 64, "{} writers are made", made.len());
+        match participant.writer("late", Profile::best_effort(1)) {
+            Ok(writer) => made.push(writer),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!(refused, DdsError::Hangs("writer"));
+    assert!(!participant.is_alive());
+    // Their end would wait for the event loop, too.
+    std::mem::forget((made, participant));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
