@@ -19,7 +19,7 @@ const DOMAIN: u16 = 20;
 /// The longest time that the route may be silent; its messages come every 20 ms. Beyond it counts
 /// what the machine had nobody do anything: all nodes start on the same processors here.
 const GAP: Duration = Duration::from_millis(200);
-/// How much later than others those who join get a processor.
+/// Nice value of those who join: processors serve the others (0) first.
 const LATER: i32 = 10;
 const SOON: Duration = Duration::from_secs(30);
 /// After the last one has what it asked for.
