@@ -34,7 +34,7 @@ use super::watch::Watches;
 use super::workers::Workers;
 use crate::auth::{Authenticator, Claims, Revocations, Right, dev};
 use crate::secrets::Keyring;
-use crate::store::{AuditEntry, Store, StoreError};
+use crate::store::{Store, StoreError};
 use blaze_domain::config::state::State;
 
 pub use history::DiffReport;
@@ -97,7 +97,7 @@ struct Inner {
     dry_running: Arc<Semaphore>,
     /// Dry runs that may still wait.
     dry_waiting: Semaphore,
-    denied: mpsc::Sender<AuditEntry>,
+    denied: mpsc::Sender<token::Denial>,
     denials: Mutex<token::DenialLimit>,
     workers: Arc<Workers>,
     digests: Digests,

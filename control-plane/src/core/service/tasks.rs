@@ -14,7 +14,8 @@ use tokio::time::{MissedTickBehavior, interval, timeout};
 use super::super::barrier::Looks;
 use super::super::committer::{Committer, follow, now, unavailable};
 use super::ConfigService;
-use crate::store::{AuditEntry, StoreError};
+use super::token::Denial;
+use crate::store::StoreError;
 
 /// Between two looks whether the store answers. With [`LOOK`] it makes two seconds at most.
 const HEALTH: Duration = Duration::from_millis(700);
@@ -32,7 +33,7 @@ const DENIALS: usize = 100;
 pub(super) struct Parts {
     pub(super) committer: Committer,
     pub(super) looks: Looks,
-    pub(super) denials: mpsc::Receiver<AuditEntry>,
+    pub(super) denials: mpsc::Receiver<Denial>,
     pub(super) history: HistorySection,
     pub(super) readiness: Readiness,
 }
@@ -183,13 +184,25 @@ impl ConfigService {
         }
     }
 
-    async fn write_denials(self, mut denials: mpsc::Receiver<AuditEntry>) {
+    async fn write_denials(self, mut denials: mpsc::Receiver<Denial>) {
         let mut batch = Vec::with_capacity(DENIALS);
         while denials.recv_many(&mut batch, DENIALS).await > 0 {
-            if let Err(error) = self.inner.store.append_audit(&batch).await {
-                tracing::warn!(%error, entries = batch.len(), "refusals are missing in the audit");
+            let (mut entries, mut readers) = (Vec::new(), Vec::new());
+            for denial in batch.drain(..) {
+                match denial {
+                    Denial::Entry(entry) => entries.push(*entry),
+                    Denial::Reader(reader) => readers.push(reader),
+                }
             }
-            batch.clear();
+            if !entries.is_empty()
+                && let Err(error) = self.inner.store.append_audit(&entries).await
+            {
+                tracing::warn!(%error, entries = entries.len(), "refusals are missing in the audit");
+            }
+            for reader in readers {
+                // Who has gone needs no answer.
+                let _ = reader.send(());
+            }
         }
         std::future::pending::<()>().await;
     }

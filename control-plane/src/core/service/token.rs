@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
 use blaze_domain::config::{Code, FieldFault, Key, Problem, Timestamp};
+use tokio::sync::oneshot;
 
 use super::super::committer::{now, outcome_unknown, unavailable};
 use super::super::page::Position;
@@ -24,6 +25,13 @@ const MAX_EXPIRES_S: u32 = 31_536_000;
 const PAGE: usize = 100;
 /// The same, at most.
 const MAX_PAGE: usize = 1000;
+
+/// What is handed to the task that writes refusals, in order.
+pub(super) enum Denial {
+    Entry(Box<AuditEntry>),
+    /// Reads the audit, and is told once all before are in it, or were reported as missing.
+    Reader(oneshot::Sender<()>),
+}
 
 /// How many refusals of an address are written in this second.
 #[derive(Default)]
@@ -83,7 +91,7 @@ impl ConfigService {
             address: address.to_string(),
             detail: problem.internal.clone(),
         };
-        if self.inner.denied.try_send(entry).is_err() {
+        if self.inner.denied.try_send(Denial::Entry(Box::new(entry))).is_err() {
             self.inner.denials.lock().skipped += 1;
         }
     }
@@ -92,6 +100,16 @@ impl ConfigService {
     #[must_use]
     pub fn denials_skipped(&self) -> u64 {
         self.inner.denials.lock().skipped
+    }
+
+    /// Waits until refusals that were answered before are in the audit, so that who looks for one
+    /// finds it.
+    async fn denials_written(&self) {
+        let (reader, written) = oneshot::channel();
+        // Neither fails but at the end of the process, when the audit is as it is.
+        if self.inner.denied.send(Denial::Reader(reader)).await.is_ok() {
+            let _ = written.await;
+        }
     }
 
     pub(super) fn entry(caller: &Caller, action: &str, key: Option<&Key>) -> AuditEntry {
@@ -135,6 +153,7 @@ impl ConfigService {
             _ => return Err(Problem::new(Code::InvalidRequest, format!("limit: 1 to {MAX_PAGE}"))),
         };
         query.limit = limit + 1;
+        self.denials_written().await;
         let mut items =
             self.inner.store.audit(&query).await.map_err(|error| unavailable(&error))?;
         let more = items.len() > limit;
