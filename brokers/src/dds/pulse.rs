@@ -29,7 +29,7 @@ const CLOCK_STEP: Duration = Duration::from_millis(500);
 pub enum Illness {
     /// A thread of RustDDS or of a reader has ended, or stands still.
     #[error("a thread of RustDDS ended or stands still")]
-    ThreadEnded,
+    Stopped,
     /// The event loop does not answer.
     #[error("the event loop of RustDDS hangs")]
     Hangs,
@@ -93,7 +93,7 @@ impl Pulse {
         let passed = now.duration_since(self.last_look);
         self.last_look = now;
         if !participant.is_alive() {
-            return Err(Illness::ThreadEnded);
+            return Err(Illness::Stopped);
         }
         self.check_clock(passed)?;
         self.nudge.give();

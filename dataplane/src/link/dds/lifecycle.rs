@@ -26,6 +26,8 @@ const GOOD_BYE: Duration = Duration::from_secs(1);
 const RETRY: Duration = Duration::from_secs(1);
 /// How long a new writer is waited for at most; RustDDS matches it within some milliseconds.
 const MATCH: Duration = Duration::from_millis(100);
+/// How long writers are made until the rest is looked at again: health, and the end.
+const MAKE: Duration = Duration::from_secs(1);
 const COUNT: Duration = Duration::from_secs(1);
 
 pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
@@ -188,7 +190,7 @@ impl Lifecycle {
         }
     }
 
-    /// Makes the writers that are wanted and missing.
+    /// Makes the writers that are wanted and missing, as far as the time of one turn goes.
     fn make_writers(&mut self) {
         let Some(generation) = &self.generation else { return };
         let missing: Vec<(Endpoint, Priority)> = {
@@ -205,7 +207,11 @@ impl Lifecycle {
             };
             wanted.iter().flat_map(classes).collect()
         };
+        let until = Instant::now() + MAKE;
         for (endpoint, class) in missing {
+            if self.shared.stop.load(Ordering::Relaxed) || Instant::now() >= until {
+                return;
+            }
             let room = profile(class, self.shared.wire.max_datagram_bytes());
             match generation.participant.writer(&topic(&endpoint, class), room) {
                 Ok(writer) => {
@@ -278,7 +284,7 @@ impl Generation {
     /// Why it must be replaced, if so.
     fn illness(&mut self) -> Option<Illness> {
         if self.readers.iter().any(|reader| !reader.is_running()) {
-            return Some(Illness::ThreadEnded);
+            return Some(Illness::Stopped);
         }
         self.pulse.feel(&self.participant).err()
     }
