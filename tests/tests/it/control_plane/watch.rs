@@ -232,7 +232,8 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
             let mut ticks = tokio::time::interval(pause);
             ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
             let (mut last, mut written) = (0, 0);
-            // Four of them: half more than anybody may be behind, which is more than lies in buffers.
+            // Four of them: 1.5 times what anybody may be behind. Buffers hold less than the
+            // difference.
             while begin.elapsed() < stands || written < MAX_BEHIND * 3 / 8 {
                 ticks.tick().await;
                 last = writer.put_one().await;
