@@ -4,7 +4,8 @@
 //! ```text
 //! hold(note) ─► thread ─► assigned? no: what was committed last ─► not held
 //!                 │            └─ yes: commit the note with a new number, read it back
-//!                 │                      └─ the same number: held, from before the commit
+//!                 │                      ├─ the same number: held, from before the commit
+//!                 │                      └─ another one, and still assigned: nobody knows
 //!                 └─► polls on in between; leaves the group when nobody asks any more
 //! ```
 //!
@@ -364,7 +365,13 @@ impl Member {
             consumer.commit(&position, CommitMode::Async)?;
             // The coordinator answers in the order of the requests.
             let (number, _) = committed(consumer, &self.topic, self.patience)?;
-            number == Some(self.number) && is_own()
+            let is_own = is_own();
+            // A coordinator takes no commit from its members while another one joins them, and the
+            // one that has the partition keeps it.
+            if is_own && number != Some(self.number) {
+                return Err(KafkaError::ConsumerCommit(RDKafkaErrorCode::RebalanceInProgress));
+            }
+            is_own
         };
         if is_held {
             self.is_warned = false;
