@@ -634,7 +634,7 @@ fn small_topics_are_back_a_second_after_a_cut() -> anyhow::Result<()> {
 
 /// What saturating cameras add to the latency of small messages, over a link of 25 ms without
 /// jitter. Publishers, brokers, both flows, the link and the consumers share two cores here, which
-/// only ever adds to it: the least of three tries counts.
+/// only ever adds to a latency: the least of three tries counts, without cameras and beside them.
 #[test]
 fn small_messages_do_not_wait_behind_images() -> anyhow::Result<()> {
     const ADDED: Duration = Duration::from_millis(2);
@@ -644,21 +644,22 @@ fn small_messages_do_not_wait_behind_images() -> anyhow::Result<()> {
     let chunk =
         Duration::from_secs_f64(f64::from(steady.mtu) * 8.0 / (NARROW.link_mbit as f64 * 1e6));
     let allowed = (ADDED + chunk).as_secs_f64() * 1e3;
-    let mut added = Vec::new();
+    let (mut without, mut with) = (f64::MAX, f64::MAX);
     for _ in 0..if long() { TRIES } else { 1 } {
-        let (without, with) = (p99_of_small(steady, false)?, p99_of_small(steady, true)?);
+        without = without.min(p99_of_small(steady, false)?);
+        with = with.min(p99_of_small(steady, true)?);
         println!(
-            "p99 of small messages: {without:.2} ms without cameras, {with:.2} ms beside them; \
-             allowed {allowed:.2} ms more"
+            "least p99 of small messages: {without:.2} ms without cameras, {with:.2} ms beside \
+             them; allowed {allowed:.2} ms more"
         );
-        added.push(with - without);
         if with - without <= allowed {
             break;
         }
     }
     anyhow::ensure!(
-        !long() || added.iter().any(|added| *added <= allowed),
-        "{added:.2?} ms more, {allowed:.2} are allowed"
+        !long() || with - without <= allowed,
+        "{:.2} ms more, {allowed:.2} are allowed",
+        with - without
     );
     Ok(())
 }
