@@ -45,8 +45,9 @@ pub use many::{
 };
 pub use trimming::{
     a_long_history_is_trimmed, a_writer_that_slept_through_a_trim_is_refused,
-    every_revision_from_the_floor_on_can_be_told, the_floor_rises_and_commits_go,
-    versions_that_hold_or_are_young_stay, what_outlives_a_commit_stays,
+    every_revision_from_the_floor_on_can_be_told, many_commits_of_others_hide_no_version,
+    the_floor_rises_and_commits_go, versions_that_hold_or_are_young_stay,
+    what_outlives_a_commit_stays,
 };
 pub use upkeep::{
     a_backup_is_restored_elsewhere, a_closed_store_is_unavailable, documents_are_rewritten_in_place,
@@ -103,6 +104,7 @@ rules!(
     versions_that_hold_or_are_young_stay,
     what_outlives_a_commit_stays,
     a_long_history_is_trimmed,
+    many_commits_of_others_hide_no_version,
     every_revision_from_the_floor_on_can_be_told,
     a_writer_that_slept_through_a_trim_is_refused,
     a_store_that_is_reopened_is_the_same,

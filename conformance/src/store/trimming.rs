@@ -93,6 +93,22 @@ pub async fn a_long_history_is_trimmed(fixture: &dyn Fixture) {
     model.check_now().await;
 }
 
+/// Newer versions of a document count, also where many commits of others came since.
+pub async fn many_commits_of_others_hide_no_version(fixture: &dyn Fixture) {
+    // More than a store looks through at once.
+    const OTHERS: usize = 205;
+    let mut model = Model::new(fixture, "hidden").await;
+    for name in ["a", "a", "b", "b", "a"].into_iter().chain(["b"; OTHERS]) {
+        model.write(&[&[name]]).await;
+    }
+    assert_eq!(model.store.trim(4, 2).await.unwrap(), 4, "the floor");
+    let found = model.store.versions(&samples::key("a"), None, 20).await.unwrap();
+    let found: Vec<u64> = found.iter().map(|version| version.revision).collect();
+    assert_eq!(found, [5, 2], "versions of a");
+    model.check_past(4).await;
+    model.check_now().await;
+}
+
 /// Audit entries and answers to repeat are there once each, however often their commits are trimmed
 /// away; a key that is taken stays taken.
 pub async fn what_outlives_a_commit_stays(fixture: &dyn Fixture) {

@@ -27,10 +27,17 @@ use crate::store::{AUDIT_KEPT_MS, READ_BYTES, StoreError};
 
 /// Records that one step moves, and versions that one command removes.
 const STEP: usize = 1_000;
+/// Documents whose versions are looked for at once.
+const KEYS: usize = 100;
+/// Records of the log that are read for them at once.
+const LOGGED: usize = 200;
 /// Revisions that are looked through before that is noted.
 const PIECE: i64 = 10_000;
 /// Bytes of the rows of one command, about.
 const BYTES: usize = 8 * 1024 * 1024;
+
+/// Revisions of documents.
+type Revisions = BTreeMap<String, BTreeSet<i64>>;
 
 impl MongoStore {
     /// Raises the floor, which readers see before anything goes, then removes.
@@ -85,15 +92,20 @@ impl MongoStore {
         keys: BTreeSet<String>,
         now: Trimmed,
     ) -> Result<(), StoreError> {
-        let mut doomed = Vec::new();
-        for key in keys {
-            let gone = to_spare(&self.revisions_of(&key, now).await?, now.floor, now.keep);
-            doomed.extend(gone.into_iter().map(|revision| rows::version_id(&key, revision)));
-            if doomed.len() >= STEP {
-                self.remove_named(std::mem::take(&mut doomed)).await?;
+        let keys: Vec<String> = keys.into_iter().collect();
+        for some in keys.chunks(KEYS) {
+            let mut doomed = Vec::new();
+            for (key, revisions) in self.revisions_of(some, now).await? {
+                let revisions: Vec<i64> = revisions.into_iter().rev().collect();
+                let gone = to_spare(&revisions, now.floor, now.keep);
+                doomed.extend(gone.into_iter().map(|revision| rows::version_id(&key, revision)));
+                if doomed.len() >= STEP {
+                    self.remove_named(std::mem::take(&mut doomed)).await?;
+                }
             }
+            self.remove_named(doomed).await?;
         }
-        self.remove_named(doomed).await
+        Ok(())
     }
 
     /// The next revision that has versions, or a record in the log that reaches it.
@@ -113,36 +125,80 @@ impl MongoStore {
         Ok(kept.into_iter().chain(logged).min())
     }
 
-    /// Revisions of the versions of a document, newest first; of those in the log, as many as
-    /// count.
-    async fn revisions_of(&self, key: &str, now: Trimmed) -> Result<Vec<i64>, StoreError> {
-        let find = self
-            .tables
-            .versions
-            .find(rows::versions_below(key, i64::MAX))
-            .projection(doc! { "_id": 1 });
-        let kept = collect(find, |found| Ok(rows::split_version_id(&rows::text(found, "_id")?)?.1));
-        let mut revisions: BTreeSet<i64> = kept.await?.into_iter().collect();
+    /// Revisions of the versions of those documents that may have some to spare; of those in the
+    /// log, as many of the newest as count.
+    async fn revisions_of(&self, keys: &[String], now: Trimmed) -> Result<Revisions, StoreError> {
+        let mut revisions = self.kept_revisions(keys).await?;
+        // Of those up to the floor the newest holds there: one alone is not to spare, however many
+        // follow.
+        revisions.retain(|_, kept| kept.range(..=now.floor).nth(1).is_some());
+        let count = usize::try_from(now.keep).unwrap_or(usize::MAX).max(1);
+        let keys: Vec<&String> = revisions.keys().collect();
+        let (mut logged, records) = self.logged_revisions(&keys, now, LOGGED).await?;
+        if records >= LOGGED {
+            // Before these records there may be others.
+            for key in keys {
+                if logged.get(key).is_none_or(|some| some.len() < count) {
+                    logged.extend(self.logged_revisions(&[key], now, count).await?.0);
+                }
+            }
+        }
+        for (key, logged) in logged {
+            revisions.entry(key).or_default().extend(logged);
+        }
+        Ok(revisions)
+    }
+
+    async fn kept_revisions(&self, keys: &[String]) -> Result<Revisions, StoreError> {
+        let each: Vec<Document> =
+            keys.iter().map(|key| rows::versions_below(key, i64::MAX)).collect();
+        let find = self.tables.versions.find(doc! { "$or": each }).projection(doc! { "_id": 1 });
+        let mut kept = Revisions::new();
+        collect(find, |found| {
+            let id = rows::text(found, "_id")?;
+            let (key, revision) = rows::split_version_id(&id)?;
+            kept.entry(key.to_owned()).or_default().insert(revision);
+            Ok(())
+        })
+        .await?;
+        Ok(kept)
+    }
+
+    /// Revisions above the floor at which documents changed, in so many of the newest records of
+    /// the log; and how many records there were.
+    async fn logged_revisions(
+        &self,
+        keys: &[&String],
+        now: Trimmed,
+        most: usize,
+    ) -> Result<(Revisions, usize), StoreError> {
+        let mut logged = Revisions::new();
+        if keys.is_empty() {
+            return Ok((logged, 0));
+        }
         let find = self
             .tables
             .events
-            .find(doc! { "docs.key": key, "_id": { "$gt": now.floor - RECORD_COMMITS } })
+            .find(doc! {
+                "docs.key": { "$in": keys },
+                "_id": { "$gt": now.floor - RECORD_COMMITS },
+            })
             .sort(doc! { "_id": -1 })
-            .limit(i64::from(now.keep).max(1))
+            .limit(i64::try_from(most).unwrap_or(i64::MAX))
             .projection(doc! { "docs.key": 1, "docs.revision": 1 });
-        let logged = collect(find, |found| {
-            let mut mine = Vec::new();
+        let records = collect(find, |found| {
             for change in rows::members(found, "docs") {
                 let change = change?;
-                if change.get_str("key").is_ok_and(|found| found == key) {
-                    mine.push(rows::integer(change, "revision")?);
+                let (key, revision) =
+                    (rows::text(change, "key")?, rows::integer(change, "revision")?);
+                if revision > now.floor && keys.binary_search(&&key).is_ok() {
+                    logged.entry(key).or_default().insert(revision);
                 }
             }
-            Ok(mine)
+            Ok(())
         });
-        let logged = logged.await?.into_iter().flatten();
-        revisions.extend(logged.filter(|revision| *revision > now.floor));
-        Ok(revisions.into_iter().rev().collect())
+        let records = records.await?.len();
+        Ok((logged, records))
     }
 
     async fn remove_named(&self, ids: Vec<String>) -> Result<(), StoreError> {

@@ -93,10 +93,11 @@ async fn each_is_told_everything_once_while_it_is_cut_and_the_history_is_trimmed
         *head.borrow()
     };
     let begin = Instant::now();
-    let (last, trims) = within("writing", limit, async { tokio::join!(writing, trimming) }).await;
+    let (last, (trims, longest)) =
+        within("writing", limit, async { tokio::join!(writing, trimming) }).await;
     assert_eq!(last, writes as u64, "each write is a commit of its own");
     end.send_replace(Some(last));
-    println!("{writes} writes and {trims} trims in {:?}", begin.elapsed());
+    println!("{writes} writes and {trims} trims in {:?}, the longest {longest:?}", begin.elapsed());
     let seen = within("the watchers", limit, following.join_all()).await;
     println!("all {} watchers are at the end after {:?}", seen.len(), begin.elapsed());
     for main in &mains {
@@ -120,25 +121,28 @@ async fn each_is_told_everything_once_while_it_is_cut_and_the_history_is_trimmed
     assert!(trims > 0 && gone > 0, "the history was trimmed, and some came too late");
 }
 
-/// Trims close behind the newest revision as long as somebody writes; how often.
+/// Trims close behind the newest revision as long as somebody writes; how often, and how long the
+/// longest took.
 async fn trim_on(
     client: Client,
     mains: [Arc<Main>; 2],
     mut head: watch::Receiver<u64>,
     floor: watch::Sender<u64>,
     mut random: StdRng,
-) -> usize {
-    let (mut next, mut trims) = (30, 0);
+) -> (usize, Duration) {
+    let (mut next, mut trims, mut longest) = (30, 0, Duration::ZERO);
     loop {
         let revision = match head.wait_for(|head| *head >= next).await {
             Ok(revision) => *revision,
-            Err(_) => return trims,
+            Err(_) => return (trims, longest),
         };
         let before = revision - random.random_range(0..10);
         let at = mains[trims % 2].at().rest;
+        let begun = Instant::now();
         let answer = client.rest.post(at, "/api/v1/trim", &json!({ "before": before })).await;
         let oldest = answer.body["oldest_revision"].as_u64().unwrap();
         assert_eq!(oldest, before - 1);
+        longest = longest.max(begun.elapsed());
         floor.send_replace(oldest);
         next = revision + random.random_range(10..60);
         trims += 1;
