@@ -18,7 +18,7 @@ use super::fold::advance;
 use super::read::Part;
 use super::rows::{Guard, Record};
 use super::statements::{RECORD_COMMITS, update_command};
-use super::{MongoStore, collect, collect_within, rows};
+use super::{MongoStore, collect_within, rows};
 use crate::store::encode::{signed, unsigned};
 use crate::store::retain::{Trimmed, to_spare};
 use crate::store::rows::VersionRow;
@@ -126,7 +126,7 @@ impl MongoStore {
     }
 
     /// Revisions of the versions of those documents that may have some to spare; of those in the
-    /// log, as many of the newest as count.
+    /// log, at least as many of the newest as are kept.
     async fn revisions_of(&self, keys: &[String], now: Trimmed) -> Result<Revisions, StoreError> {
         let mut revisions = self.kept_revisions(keys).await?;
         // Of those up to the floor the newest holds there: one alone is not to spare, however many
@@ -136,7 +136,7 @@ impl MongoStore {
         let keys: Vec<&String> = revisions.keys().collect();
         let (mut logged, records) = self.logged_revisions(&keys, now, LOGGED).await?;
         if records >= LOGGED {
-            // Before these records there may be others.
+            // There may be older ones.
             for key in keys {
                 if logged.get(key).is_none_or(|some| some.len() < count) {
                     logged.extend(self.logged_revisions(&[key], now, count).await?.0);
@@ -154,7 +154,7 @@ impl MongoStore {
             keys.iter().map(|key| rows::versions_below(key, i64::MAX)).collect();
         let find = self.tables.versions.find(doc! { "$or": each }).projection(doc! { "_id": 1 });
         let mut kept = Revisions::new();
-        collect(find, |found| {
+        collect_within(LONG, find, |found| {
             let id = rows::text(found, "_id")?;
             let (key, revision) = rows::split_version_id(&id)?;
             kept.entry(key.to_owned()).or_default().insert(revision);
@@ -165,7 +165,7 @@ impl MongoStore {
     }
 
     /// Revisions above the floor at which documents changed, in so many of the newest records of
-    /// the log; and how many records there were.
+    /// the log that hold any of them; and how many records these were.
     async fn logged_revisions(
         &self,
         keys: &[&String],
@@ -182,11 +182,12 @@ impl MongoStore {
             .find(doc! {
                 "docs.key": { "$in": keys },
                 "_id": { "$gt": now.floor - RECORD_COMMITS },
+                "last": { "$gt": now.floor },
             })
             .sort(doc! { "_id": -1 })
             .limit(i64::try_from(most).unwrap_or(i64::MAX))
             .projection(doc! { "docs.key": 1, "docs.revision": 1 });
-        let records = collect(find, |found| {
+        let records = collect_within(LONG, find, |found| {
             for change in rows::members(found, "docs") {
                 let change = change?;
                 let (key, revision) =

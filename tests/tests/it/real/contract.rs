@@ -34,7 +34,9 @@ fn a_burst_into_a_topic_with_small_batches_is_whole() -> anyhow::Result<()> {
     while arrived.len() < SMALL as usize {
         let record = records.next(SOON);
         let record = record.ok_or_else(|| {
-            anyhow::anyhow!("{} came\n{:?}", arrived.len(), system.cloud.bridges())
+            let (robot, cloud) = (system.robot.bridges(), system.cloud.bridges());
+            let tails = format!("{}\n{}", system.robot.tail(), system.cloud.tail());
+            anyhow::anyhow!("{} came\n{robot:?}\n{cloud:?}\n{tails}", arrived.len())
         })?;
         arrived.push(record.text().parse::<u64>()?);
     }
