@@ -28,7 +28,7 @@ impl RobotAndCloud {
         let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
         let domain = free_domain()?;
         let robot = FlowSpec::new("edge", "robot-1").on_redis(redis, &redis_prefix).joined(domain);
-        // No burst is thinned out to the budget of a link: others prove that.
+        // A topic counts by its largest message, so a burst with a large one would be thinned out.
         let robot = FlowSpec { limit_mbps: 100_000.0, ..robot };
         let cloud = FlowSpec::new("cloud", "cloud-1").on_kafka(kafka, &kafka_prefix).joined(domain);
         let (mut robot, mut cloud) = (FlowProcess::launch(robot)?, FlowProcess::launch(cloud)?);
