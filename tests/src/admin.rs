@@ -21,7 +21,7 @@ impl Admin {
     /// Status and body of `GET path`.
     ///
     /// # Errors
-    /// When nothing answers within two seconds, or the answer is no HTTP.
+    /// When nothing answers within five seconds, or the answer is no HTTP.
     pub fn get(&self, path: &str) -> anyhow::Result<(u16, String)> {
         let answer = self.ask(path)?;
         let (head, body) = answer.split_once("\r\n\r\n").context("no end of the HTTP header")?;
@@ -58,7 +58,7 @@ impl Admin {
     }
 
     fn ask(&self, path: &str) -> anyhow::Result<String> {
-        let timeout = Duration::from_secs(2);
+        let timeout = Duration::from_secs(5);
         let mut stream = connect(self.namespace.as_deref(), self.address, timeout)?;
         stream.set_read_timeout(Some(timeout))?;
         write!(

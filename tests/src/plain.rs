@@ -17,6 +17,9 @@ use rdkafka::{ClientConfig, ClientContext};
 use redis::{IntoConnectionInfo as _, ProtocolVersion, PushKind};
 use serde_json::Value;
 
+/// How long a Redis may take to answer on a busy machine.
+const ANSWER: Duration = Duration::from_secs(10);
+
 /// A record as a plain consumer sees it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Record {
@@ -124,15 +127,15 @@ impl KafkaReader {
 /// A plain connection to Redis.
 ///
 /// # Errors
-/// When the server does not answer within two seconds.
+/// When the server does not answer within ten seconds.
 pub fn connect(url: &str) -> anyhow::Result<redis::Connection> {
-    Ok(redis::Client::open(url)?.get_connection_with_timeout(Duration::from_secs(2))?)
+    Ok(redis::Client::open(url)?.get_connection_with_timeout(ANSWER)?)
 }
 
 /// Publishes on a Redis channel, as `redis-cli publish` does. Gives how many heard it.
 ///
 /// # Errors
-/// When the server does not answer within two seconds.
+/// When the server does not answer within ten seconds.
 pub fn publish(url: &str, channel: &str, payload: &[u8]) -> anyhow::Result<i64> {
     let mut command = redis::cmd("PUBLISH");
     Ok(command.arg(channel).arg(payload).query(&mut connect(url)?)?)
@@ -166,15 +169,15 @@ impl RedisReader {
     /// Subscribes to a channel, prefix included.
     ///
     /// # Errors
-    /// When the server does not answer within two seconds.
+    /// When the server does not answer within ten seconds.
     pub fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
         let info = url.into_connection_info()?;
         // In RESP2 the client library takes a message for the late answer to a read that timed out,
         // and skips it.
         let settings = info.redis_settings().clone().set_protocol(ProtocolVersion::RESP3);
         let client = redis::Client::open(info.set_redis_settings(settings))?;
-        let mut connection = client.get_connection_with_timeout(Duration::from_secs(2))?;
-        connection.set_read_timeout(Some(Duration::from_secs(2)))?;
+        let mut connection = client.get_connection_with_timeout(ANSWER)?;
+        connection.set_read_timeout(Some(ANSWER))?;
         connection
             .send_packed_command(&redis::cmd("SUBSCRIBE").arg(channel).get_packed_command())?;
         connection.recv_response()?;
@@ -258,7 +261,8 @@ impl KafkaWriter {
         let producer = client(bootstrap)
             .set("linger.ms", "0")
             .set("message.max.bytes", "17825792")
-            .set("message.timeout.ms", "5000")
+            // A server that makes many topics at once takes seconds for a record.
+            .set("message.timeout.ms", "20000")
             .set("reconnect.backoff.max.ms", "200")
             .create_with_context(Deliveries::default())?;
         Ok(Self { producer })
@@ -274,7 +278,7 @@ impl KafkaWriter {
     }
 
     fn delivered(&self) -> anyhow::Result<()> {
-        self.producer.flush(Duration::from_secs(10))?;
+        self.producer.flush(Duration::from_secs(25))?;
         match self.producer.context().failed.lock().take() {
             None => Ok(()),
             Some(error) => Err(error).context("a record was not taken by Kafka"),

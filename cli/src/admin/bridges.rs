@@ -21,6 +21,18 @@ pub struct Bridges {
     #[serde(default)]
     not_owner: Vec<Elsewhere>,
     balance: Option<Balance>,
+    /// What it dropped before a bridge took it; the topic is empty where it is not known.
+    #[serde(default)]
+    pub dropped_before_bridges: Vec<DroppedBefore>,
+}
+
+/// Messages of a topic that a flow dropped before a bridge took them.
+#[derive(Debug, Clone, Deserialize)]
+pub struct DroppedBefore {
+    /// The topic.
+    pub topic: String,
+    /// Messages by reason.
+    pub dropped: BTreeMap<String, u64>,
 }
 
 /// A topic of the layer that another flow carries out of it.
@@ -165,13 +177,21 @@ pub(super) fn table(
     Ok(text)
 }
 
-/// What the flow carries among those of its layer; nothing where it shares its layer with nobody.
+/// What the flow carries among those of its layer, and what no bridge took; nothing where it shares
+/// its layer with nobody and dropped nothing.
 fn group_text(answer: &Bridges) -> String {
     let mut text = String::new();
     for elsewhere in &answer.not_owner {
         text.push_str(&format!(
             "{} is carried out of the layer by {}\n",
             elsewhere.topic, elsewhere.owner
+        ));
+    }
+    for row in &answer.dropped_before_bridges {
+        let topic = if row.topic.is_empty() { "unknown topics" } else { &row.topic };
+        text.push_str(&format!(
+            "dropped before any bridge: {topic}: {}\n",
+            dropped_text(&row.dropped)
         ));
     }
     let Some(balance) = &answer.balance else { return text };

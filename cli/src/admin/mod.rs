@@ -16,7 +16,7 @@ use crate::http::get_json;
 use crate::output::{self, Format, terminal_width};
 
 pub(crate) use bridges::dropped_text;
-pub use bridges::{Bridge, Bridges, Place};
+pub use bridges::{Bridge, Bridges, DroppedBefore, Place};
 pub use top::TopOptions;
 
 /// `blaze topics`.

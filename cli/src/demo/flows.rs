@@ -5,9 +5,10 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use blaze_domain::DropReason;
 use tokio::time::timeout;
 
-use crate::admin::{Bridge, Bridges, typed};
+use crate::admin::{Bridge, Bridges, DroppedBefore, typed};
 use crate::args::FlowAddress;
 use crate::http::get_json;
 
@@ -20,6 +21,8 @@ const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 #[derive(Debug, Clone, Default)]
 pub struct FlowView {
     bridges: Vec<(DemoNode, Bridge)>,
+    /// What the flows dropped before a bridge took it.
+    dropped_before: Vec<(DemoNode, DroppedBefore)>,
 }
 
 /// How a topic travels from its publisher to a consumer.
@@ -27,7 +30,10 @@ pub struct FlowView {
 pub struct Path {
     /// Scopes in order, `scope:broker`.
     pub route: Vec<String>,
-    /// What the bridges on the way dropped since they were made, by reason.
+    /// Nodes whose flows carry it, without order.
+    pub nodes: BTreeSet<DemoNode>,
+    /// What the bridges on the way dropped since they were made, and the flows on the way before
+    /// their bridges took it, by reason.
     pub dropped: BTreeMap<String, u64>,
 }
 
@@ -54,6 +60,8 @@ impl FlowView {
             };
             if let Ok(answer) = typed::<Bridges>(&address, &value) {
                 view.bridges.extend(answer.bridges.into_iter().map(|bridge| (*node, bridge)));
+                let dropped = answer.dropped_before_bridges.into_iter();
+                view.dropped_before.extend(dropped.map(|dropped| (*node, dropped)));
             }
         }
         view
@@ -87,11 +95,27 @@ impl FlowView {
             Spot::Node(node) => node.layer().to_owned(),
             Spot::Layer(layer) | Spot::Inter(layer) => layer.clone(),
         };
-        search(&edges, from, to).or_else(|| search(&edges, &Spot::Inter(layer), to))
+        let mut path =
+            search(&edges, from, to).or_else(|| search(&edges, &Spot::Inter(layer), to))?;
+        let on_the_way = |node: &DemoNode| path.nodes.contains(node);
+        let before = self
+            .dropped_before
+            .iter()
+            .filter(|(node, row)| on_the_way(node) && (row.topic == topic || row.topic.is_empty()));
+        for (_, row) in before {
+            for (reason, count) in &row.dropped {
+                // A message whose first part is missing has no name: it may be one of this topic.
+                if row.topic == topic || reason == DropReason::ReassemblyTimeout.as_str() {
+                    *path.dropped.entry(reason.clone()).or_default() += count;
+                }
+            }
+        }
+        Some(path)
     }
 }
 
 struct Edge<'a> {
+    node: DemoNode,
     from: Spot,
     to: Spot,
     bridge: &'a Bridge,
@@ -106,6 +130,7 @@ impl<'a> Edge<'a> {
             _ => None,
         };
         Some(Self {
+            node,
             from: spot(&bridge.from.scope, None)?,
             to: spot(&bridge.to.scope, bridge.to.layer.as_ref())?,
             bridge,
@@ -139,6 +164,7 @@ fn trace(edges: &[Edge<'_>], reached: &BTreeMap<&Spot, Option<usize>>, to: &Spot
             path.route.push(edge.bridge.to.label());
         }
         path.route.push(edge.bridge.from.label());
+        path.nodes.insert(edge.node);
         for (reason, count) in &edge.bridge.dropped {
             *path.dropped.entry(reason.clone()).or_default() += count;
         }
@@ -160,6 +186,7 @@ mod tests {
                 .iter()
                 .map(|(node, bridge)| (*node, Bridge::deserialize(bridge).unwrap()))
                 .collect(),
+            dropped_before: Vec::new(),
         }
     }
 
@@ -209,6 +236,26 @@ mod tests {
                 "robot-1 node→layer",
             ]
         );
+    }
+
+    #[test]
+    fn what_the_receiving_flow_drops_before_its_bridge_counts() {
+        let mut view = demo();
+        let row = |topic: &str, dropped: Value| {
+            DroppedBefore::deserialize(json!({"topic": topic, "dropped": dropped})).unwrap()
+        };
+        view.dropped_before = vec![
+            (DemoNode::Cloud1, row("imu/data", json!({"lifespan": 4}))),
+            // Without its first part it has no name.
+            (DemoNode::Cloud1, row("", json!({"reassembly_timeout": 1, "no_destination": 9}))),
+            (DemoNode::Cloud1, row("odom", json!({"lifespan": 90}))),
+            // Not on the way.
+            (DemoNode::Edge2, row("imu/data", json!({"lifespan": 90}))),
+        ];
+        let robot = Spot::Node(DemoNode::Robot1);
+        let cloud = view.path("imu/data", &robot, &Spot::Layer("cloud".to_owned())).unwrap();
+        let expected = [("lifespan", 6), ("rate_limit", 8), ("reassembly_timeout", 1)];
+        assert_eq!(cloud.dropped, expected.map(|(reason, n)| (reason.to_owned(), n)).into());
     }
 
     #[test]

@@ -19,7 +19,7 @@ use super::player::{Played, Player, PlayerReport};
 use super::report::Report;
 use super::roles::{Consumer, MOVES_FROM, MOVES_TO, MOVING_SERVICE};
 use super::stage::{Script, Stage};
-use super::verdict::{Outcome, Summary, judge};
+use super::verdict::{Outcome, Summary, has_reasons, judge};
 use crate::exit::CliError;
 
 /// How long the moved consumer may wait for its first message before it leaves its old place.
@@ -70,7 +70,6 @@ pub async fn run<S: Stage, Out: Write, Err: Write>(
         report.event(played, &pace_text(&pace))?;
     }
     session.drain().await;
-    session.look().await;
     let interrupted = interruption.is_some();
     session.faults.extend(interruption.flatten());
     let changes = std::mem::take(&mut *session.changes.lock());
@@ -345,7 +344,7 @@ impl<S: Stage> Session<'_, S> {
         last
     }
 
-    /// Waits until nothing more arrives.
+    /// Waits until nothing more arrives, and looks at the flows until each lost picture is counted.
     async fn drain(&self) {
         let deadline = Instant::now() + DRAIN_LIMIT;
         let mut received = self.board.received_by_all();
@@ -357,6 +356,15 @@ impl<S: Stage> Session<'_, S> {
                 received = now;
                 since = Instant::now();
             }
+        }
+        // One that came in part is counted when its lifespan ends.
+        loop {
+            self.look().await;
+            let now = Instant::now();
+            if now >= deadline || self.board.total(now).iter().all(has_reasons) {
+                return;
+            }
+            sleep(LOOK_PERIOD).await;
         }
     }
 }

@@ -23,6 +23,7 @@ use super::plane::wall_ms;
 use super::routes::SourceState;
 use crate::control::ControlCore;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
+use crate::lane::stats::Drops;
 use crate::plan::Target;
 use crate::registry::{LeaseView, Terms};
 use crate::world::{Advertise, Request};
@@ -200,9 +201,12 @@ fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) 
 async fn bridges(State(shared): App) -> Json<Value> {
     let now = Instant::now();
     // First the places, then whether they are subscribed: the two locks are never held together.
-    let mut rows = shared.plane.read(|state| {
+    let (mut rows, before_bridges) = shared.plane.read(|state| {
         let mut rows = Vec::new();
+        let mut before_bridges: Vec<Value> =
+            dropped_row("", &state.core.unattributed).into_iter().collect();
         for (id, path) in state.core.topics_mut() {
+            before_bridges.extend(dropped_row(path.name.as_str(), &path.ingress_drops));
             path.bridges.iter_mut().for_each(|bridge| {
                 bridge.settle();
             });
@@ -210,7 +214,7 @@ async fn bridges(State(shared): App) -> Json<Value> {
                 rows.push((id, bridge.from, bridge_row(&shared, now, path, bridge)));
             }
         }
-        rows
+        (rows, before_bridges)
     });
     for (id, from, row) in &mut rows {
         if row["state"] != "up" {
@@ -234,7 +238,21 @@ async fn bridges(State(shared): App) -> Json<Value> {
         .collect();
     let balance = balance(now, &control);
     drop(control);
-    answer(&shared, json!({"bridges": rows, "not_owner": not_owner, "balance": balance}))
+    let answers = json!({
+        "bridges": rows, "not_owner": not_owner, "balance": balance,
+        "dropped_before_bridges": before_bridges,
+    });
+    answer(&shared, answers)
+}
+
+fn dropped(drops: &Drops) -> Map<String, Value> {
+    drops.iter().map(|(reason, count)| (reason.as_str().to_owned(), json!(count))).collect()
+}
+
+/// Messages of a topic that were dropped before a bridge took them; nothing if there are none.
+fn dropped_row(topic: &str, drops: &Drops) -> Option<Value> {
+    let dropped = dropped(drops);
+    (!dropped.is_empty()).then(|| json!({"topic": topic, "dropped": dropped}))
 }
 
 /// How much this flow carries, and the topics that it gave to other flows of its layer.
@@ -297,12 +315,7 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
     };
     let mut to = scope_and_broker(shared, to_scope);
     extend(&mut to, json!({"layer": layer, "flow": flow}));
-    let dropped: Map<String, Value> = bridge
-        .stats
-        .dropped
-        .iter()
-        .map(|(reason, count)| (reason.to_string(), json!(count)))
-        .collect();
+    let dropped = dropped(&bridge.stats.dropped);
     let class = match bridge.sink {
         Sink::Lane { class, .. } => json!(class),
         Sink::Publish { .. } => Value::Null,

@@ -46,8 +46,8 @@ fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
     // Ten seconds are the shortest with changes of the configuration.
     let seconds = if blaze_tests::long() { "30s" } else { "10s" };
     let run = demo(&["--duration", seconds]);
+    assert_eq!(run.summary["ok"], true, "{}\n{}", run.summary["problems"], run.tail);
     assert_eq!(run.code, Some(0), "{}", run.tail);
-    assert_eq!(run.summary["ok"], true, "{}", run.summary);
     for layer in ["fog", "cloud"] {
         let first = number(&run.summary["first_message_s"][layer]);
         assert!(first <= 10.0, "first message in {layer} after {first} s");
