@@ -1,9 +1,10 @@
 //! Benchmarks of the product, each beside a peer or a plain client in the same run.
 //!
-//! `cargo build --release --workspace --bins && target/release/blaze-bench flow|config|worker`
+//! `cargo build --release --workspace --bins && target/release/blaze-bench flow|link|config|worker`
 
 mod config;
 mod flow;
+mod link;
 mod worker;
 
 use std::process::ExitCode;
@@ -14,6 +15,7 @@ use clap::Parser;
 #[command(name = "blaze-bench", version)]
 enum Bench {
     Flow(flow::Arguments),
+    Link(link::Arguments),
     Config(config::Arguments),
     Worker(worker::Arguments),
 }
@@ -21,6 +23,7 @@ enum Bench {
 fn main() -> anyhow::Result<ExitCode> {
     match Bench::parse() {
         Bench::Flow(arguments) => flow::run(arguments).map(|()| ExitCode::SUCCESS),
+        Bench::Link(arguments) => link::run(&arguments).map(|()| ExitCode::SUCCESS),
         Bench::Config(arguments) => config::run(&arguments),
         Bench::Worker(arguments) => worker::run(&arguments),
     }

@@ -8,6 +8,7 @@ mod namespace;
 mod plan;
 mod routes;
 mod topology;
+pub mod udp;
 
 pub use link::Link;
 pub use namespace::{connect, inside, program, run};

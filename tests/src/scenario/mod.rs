@@ -6,6 +6,8 @@
 //!
 //! A new scenario is a new value of [`Scenario`]; the runner is for all of them.
 
+pub mod budget;
+pub mod parts;
 mod report;
 mod run;
 

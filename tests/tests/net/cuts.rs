@@ -6,13 +6,12 @@ use std::time::{Duration, Instant};
 
 use blaze_tests::flow::FlowProcess;
 use blaze_tests::long;
+use blaze_tests::network::udp::{Reading, busiest};
+use blaze_tests::scenario::parts::{IMU, one_link, stream};
 use blaze_tests::scenario::{BrokerKind, Running, Stream};
 use blaze_tests::wan::{Shape, Ways};
 use blaze_tests::{wait, within};
 use serde_json::Value;
-
-use super::layers::{IMU, one_link, stream};
-use super::support::{Reading, busiest};
 
 const EVENTS: &str = "robot/events";
 const SCANS: &str = "robot/scans";

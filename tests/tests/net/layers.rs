@@ -5,12 +5,10 @@ use std::time::Duration;
 
 use blaze_tests::long;
 use blaze_tests::network::Plan;
-use blaze_tests::scenario::{Broker, BrokerKind, Expect, Flow, Scenario, Service, Stream, run};
+use blaze_tests::scenario::parts::{CAMERA, IMU, ODOMETRY, broker, flow, service, stream};
+use blaze_tests::scenario::{BrokerKind, Expect, Scenario, Stream, run};
 use blaze_tests::wan::Shape;
 
-pub(super) const IMU: &str = "imu/data";
-pub(super) const ODOMETRY: &str = "jackal_velocity_controller/odom";
-pub(super) const CAMERA: &str = "camera/image_raw";
 pub(super) const COMMANDS: &str = "fleet/commands";
 pub(super) const MAP: &str = "fleet/map";
 /// 640 × 480 RGB.
@@ -18,78 +16,9 @@ const IMAGE: usize = 921_600;
 /// DDS domain of the robots' layer.
 const EDGE_DOMAIN: u16 = 30;
 
-pub(super) fn stream(topic: &'static str, hz: f64, bytes: usize) -> Stream {
-    Stream { topic, reliable: true, hz, bytes, lifespan: Duration::ZERO, payloads: None }
-}
-
 /// The camera as it comes from the driver: best effort, and old pictures are worth nothing.
 pub(super) fn camera(hz: f64) -> Stream {
     Stream { reliable: false, lifespan: Duration::from_secs(1), ..stream(CAMERA, hz, IMAGE) }
-}
-
-pub(super) fn flow(
-    layer: &'static str,
-    node: &'static str,
-    broker: &'static str,
-    layer_domain: Option<u16>,
-    peers: &[&'static str],
-) -> Flow {
-    Flow {
-        layer,
-        node,
-        host: node,
-        brokers: vec![broker],
-        layer_domain,
-        peers: peers.to_vec(),
-        limit_mbps: 100.0,
-        bandwidth: "",
-        keys: "",
-    }
-}
-
-pub(super) fn service(
-    name: &'static str,
-    flow: &'static str,
-    broker: &'static str,
-    streams: Vec<Stream>,
-) -> Service {
-    Service { name, flow, broker, streams }
-}
-
-pub(super) fn broker(name: &'static str, host: &'static str, kind: BrokerKind) -> Broker {
-    Broker { name, host, kind }
-}
-
-/// A robot with a Redis, a cloud with some broker, one link between them, and streams from the one
-/// to the other; without faults or an end.
-pub(super) fn one_link(
-    shape: Shape,
-    cloud: BrokerKind,
-    limit_mbps: f64,
-    streams: Vec<Stream>,
-) -> Scenario {
-    let flow = |layer, node, broker, peers: &[&'static str]| Flow {
-        limit_mbps,
-        ..flow(layer, node, broker, None, peers)
-    };
-    Scenario {
-        name: "a robot and a cloud",
-        network: Plan::two_hosts("robot-1", "cloud-1", shape),
-        brokers: vec![
-            broker("redis", "robot-1", BrokerKind::Redis),
-            broker("cloud-broker", "cloud-1", cloud),
-        ],
-        flows: vec![
-            flow("edge", "robot-1", "redis", &["cloud-1"]),
-            flow("cloud", "cloud-1", "cloud-broker", &[]),
-        ],
-        publishers: vec![service("driver", "robot-1", "redis", streams.clone())],
-        consumers: vec![service("recorder", "cloud-1", "cloud-broker", streams)],
-        faults: vec![],
-        duration: Duration::ZERO,
-        settle: Duration::ZERO,
-        expect: vec![],
-    }
 }
 
 /// Robots with a Redis each meet over DDS in the edge; fog and cloud have a Kafka each, the fog two

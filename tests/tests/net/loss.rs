@@ -4,10 +4,9 @@
 use std::time::Duration;
 
 use blaze_tests::long;
+use blaze_tests::scenario::parts::{one_link, stream};
 use blaze_tests::scenario::{BrokerKind, Route, Running, Stream};
 use blaze_tests::wan::{Change, Shape, Ways};
-
-use super::layers::{one_link, stream};
 
 const BEST_EFFORT: &str = "imu/best_effort";
 const RELIABLE: &str = "imu/reliable";

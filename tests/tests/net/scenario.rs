@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use blaze_tests::long;
 use blaze_tests::network::Plan;
+use blaze_tests::scenario::parts::{IMU, broker, flow, service, stream};
 use blaze_tests::scenario::{BrokerKind, Expect, Fault, Scenario, run};
 use blaze_tests::wan::{Change, Shape, Ways};
 
-use super::layers::{COMMANDS, IMU, broker, flow, service, stream};
+use super::layers::COMMANDS;
 
 /// A robot with Redis behind the router of its edge, a cloud with Kafka, and the link of the
 /// paper's testbed between them. It is cut for less than the time after which a flow counts as

@@ -2,11 +2,12 @@
 
 use std::time::{Duration, Instant};
 
+use blaze_tests::network::udp::{Sink, ping, socket};
 use blaze_tests::network::{Plan, Topology};
 use blaze_tests::wan::{Change, Shape, Ways};
 use blaze_tests::{long, wait};
 
-use crate::support::{Sink, ping, reaches, received_bytes, socket};
+use crate::support::{reaches, received_bytes};
 
 const MS: Duration = Duration::from_millis(1);
 /// Where packets must arrive that are on the way.
