@@ -19,8 +19,8 @@ use blaze_tests::network::udp::{Reading, Sink, ping, socket};
 use blaze_tests::network::{Plan, Topology};
 use blaze_tests::scenario::Running;
 use blaze_tests::scenario::budget::{
-    FRONT, FULL, NARROW, REAR, ROWS, Row, SETTLE, Seen, look_at_settled, p99_of_small, reckoned,
-    scenario, shape, steady, streams,
+    COMPUTED, FRONT, FULL, NARROW, REAR, ROWS, Row, SETTLE, Seen, look_at_settled, p99_of_small,
+    reckoned, scenario, shape, steady, streams,
 };
 use clap::Parser;
 
@@ -61,7 +61,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "CPU/core",
         "ms/IMAGE"
     );
-    for row in ROWS.iter().filter(|row| row.name.contains(&arguments.only)) {
+    for row in ROWS.iter().chain(&COMPUTED).filter(|row| row.name.contains(&arguments.only)) {
         rates(row, time)?;
     }
     println!("\n{:<26} {:>12} {:>9} {:>9}", "p99/ms OF SMALL MESSAGES", "ALONE", "BESIDE", "ADDED");
