@@ -97,15 +97,14 @@ impl FlowView {
         };
         let mut path =
             search(&edges, from, to).or_else(|| search(&edges, &Spot::Inter(layer), to))?;
-        let on_the_way = |node: &DemoNode| path.nodes.contains(node);
-        let before = self
-            .dropped_before
-            .iter()
-            .filter(|(node, row)| on_the_way(node) && (row.topic == topic || row.topic.is_empty()));
-        for (_, row) in before {
+        // A message whose first part is missing has no topic: it may be one of this.
+        let may_be_of_topic = |row: &DroppedBefore, reason: &str| {
+            row.topic == topic
+                || (row.topic.is_empty() && reason == DropReason::ReassemblyTimeout.as_str())
+        };
+        for (node, row) in &self.dropped_before {
             for (reason, count) in &row.dropped {
-                // A message whose first part is missing has no name: it may be one of this topic.
-                if row.topic == topic || reason == DropReason::ReassemblyTimeout.as_str() {
+                if path.nodes.contains(node) && may_be_of_topic(row, reason) {
                     *path.dropped.entry(reason.clone()).or_default() += count;
                 }
             }

@@ -65,7 +65,7 @@ impl Sink {
     /// Sends packets of so many payload bytes from a socket, at a pace.
     ///
     /// # Errors
-    /// When the system takes one not.
+    /// When the system refuses a packet.
     pub fn send(
         &self,
         from: &UdpSocket,

@@ -136,7 +136,7 @@ pub const FULL: Row = Row::new("160 Mbit/s", 160, 150.0);
 /// A narrow one.
 pub const NARROW: Row = Row::new("40 Mbit/s", 40, 37.0);
 
-/// Rows where the link decides.
+/// Rows limited by the link.
 pub const ROWS: [Row; 8] = [
     NARROW,
     Row::new("40 Mbit/s, LZ4 adaptive", 40, 37.0).compressed("level: 10"),
@@ -147,7 +147,7 @@ pub const ROWS: [Row; 8] = [
     FULL,
     Row::new("160 Mbit/s, fair", 160, 150.0).fair(),
 ];
-/// Rows where what two cores compress decides, and not what the link carries.
+/// Rows limited by how fast two cores compress, not by the link.
 pub const COMPUTED: [Row; 2] = [
     Row::new("160 Mbit/s, LZ4 level 9", 160, 150.0).compressed("level: 9, adaptive: false"),
     Row::new("160 Mbit/s, LZ4 level 10", 160, 150.0).compressed("level: 10, adaptive: false"),

@@ -22,7 +22,7 @@ use crate::cuts::{DELIVERY, DOWN, FLOWING, dropped, hold_cut, watch};
 const OF_EVERY_RUN: usize = 2;
 /// Of the budget, and of the rates that the allocation gives images, so much is used at least.
 /// Where others have a part of the two cores, publishers, brokers, flows, the link and consumers
-/// get less done; a flow that stands still or sends half shows all the same.
+/// get less done; a flow that stands still or sends less than half shows all the same.
 const USED: f64 = 0.5;
 /// Of small topics so many arrive.
 const SMALL: f64 = 0.999;
