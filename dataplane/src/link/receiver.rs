@@ -7,8 +7,8 @@
 //! ```
 //!
 //! Each message is settled once: delivered, dropped or given up. A settled one is never looked at
-//! again. What is dropped is counted here; of what is given up before anything of it came the
-//! sender is told, which counts it: here it has no name.
+//! again. What is dropped is counted here. What is given up before it was complete is counted by its
+//! sender, which is told of it: it may have given it up, too, or know what nothing came of by name.
 
 mod settle;
 mod timing;
@@ -48,7 +48,7 @@ pub(crate) const MISSING_RANGES: usize = 32;
 /// Missing ranges that a Feedback tells beyond those, by their distances, as far as its datagram
 /// has room. All that is lost in a round trip should fit: what does not waits for the next one.
 pub(crate) const MORE_RANGES: usize = 512;
-/// Messages in one Feedback that were given up although nothing of them came.
+/// Messages in one Feedback that were given up before they were complete.
 pub(crate) const GIVEN_UP_TOLD: usize = 64;
 /// Such messages that are kept until their sender has settled them; more are counted here.
 const MAX_GIVEN_UP: usize = 1_024;
@@ -100,9 +100,6 @@ pub(crate) struct Inbox<'a> {
 
 impl Inbox<'_> {
     fn dropped(&mut self, topic: &str, reason: DropReason) {
-        if reason == DropReason::ReassemblyTimeout {
-            self.counters.reassembly_timeouts += 1;
-        }
         self.events.push_back(LinkEvent::ReceiverDropped {
             topic: topic.chars().take(200).collect(),
             reason,
@@ -140,7 +137,7 @@ pub(crate) struct ReceiveClass {
     /// Messages below are settled.
     message_floor: u64,
     settled: RangeSet,
-    /// Given up although nothing of them came, and not settled by the sender yet.
+    /// Given up before they were complete, and not settled by the sender yet.
     given_up: BTreeSet<u32>,
     assemblies: HashMap<u32, Assembly>,
     held: BTreeMap<u32, Held>,

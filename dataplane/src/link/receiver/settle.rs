@@ -24,8 +24,11 @@ impl ReceiveClass {
             }
         }
         if self.settled.len() > MAX_MESSAGE_RANGES
-            && let Some((_, end)) = self.settled.first()
+            && let Some((first, end)) = self.settled.first()
         {
+            for number in self.unfinished_below(first) {
+                self.give_up(inbox, number, DropReason::ReassemblyTimeout);
+            }
             self.give_up_below(inbox, end + 1);
         }
     }
@@ -40,7 +43,8 @@ impl ReceiveClass {
         }
     }
 
-    /// Everything below `floor` that has not come is given up.
+    /// Everything below `floor` that has not come is given up: the sender is through with it, and
+    /// has counted it.
     pub(super) fn give_up_below(&mut self, inbox: &mut Inbox<'_>, floor: u64) {
         if floor <= self.message_floor {
             return;
@@ -53,13 +57,8 @@ impl ReceiveClass {
             self.message_floor = last + 1;
             self.settled.remove_through(last);
         }
-        if !self.assemblies.is_empty() {
-            let floor = self.message_floor;
-            let gone: Vec<u32> =
-                self.assemblies.keys().copied().filter(|n| u64::from(*n) < floor).collect();
-            for number in gone {
-                self.drop_assembly(inbox, number, DropReason::ReassemblyTimeout);
-            }
+        for number in self.unfinished_below(self.message_floor) {
+            self.remove_assembly(number);
         }
         self.release_ready(inbox);
     }
@@ -93,9 +92,26 @@ impl ReceiveClass {
         self.settle(inbox, number);
     }
 
-    pub(super) fn drop_assembly(&mut self, inbox: &mut Inbox<'_>, number: u32, reason: DropReason) {
+    fn unfinished_below(&self, floor: u64) -> Vec<u32> {
+        self.assemblies.keys().copied().filter(|number| u64::from(*number) < floor).collect()
+    }
+
+    fn drop_assembly(&mut self, inbox: &mut Inbox<'_>, number: u32, reason: DropReason) {
         if let Some(assembly) = self.remove_assembly(number) {
+            inbox.counters.reassembly_timeouts +=
+                u64::from(reason == DropReason::ReassemblyTimeout);
             inbox.dropped(assembly.topic(), reason);
+        }
+    }
+
+    /// Gives up an unfinished message. It is to be settled.
+    pub(super) fn give_up(&mut self, inbox: &mut Inbox<'_>, number: u32, reason: DropReason) {
+        if self.given_up.len() >= MAX_GIVEN_UP {
+            self.drop_assembly(inbox, number, reason);
+        } else if self.remove_assembly(number).is_some() {
+            inbox.counters.reassembly_timeouts +=
+                u64::from(reason == DropReason::ReassemblyTimeout);
+            self.given_up.insert(number);
         }
     }
 
@@ -107,21 +123,13 @@ impl ReceiveClass {
         }
         if at != number {
             if self.assemblies.contains_key(&at) {
-                self.drop_assembly(inbox, at, DropReason::ReassemblyTimeout);
-            } else {
-                self.note_given_up(inbox, at, number);
+                self.give_up(inbox, at, DropReason::ReassemblyTimeout);
+            } else if self.given_up.len() < MAX_GIVEN_UP {
+                self.given_up.insert(at);
+            } else if let Some(held) = self.held.get(&number) {
+                inbox.dropped(held.message.frame.topic(), DropReason::ReassemblyTimeout);
             }
             self.settle(inbox, at);
-        }
-    }
-
-    /// Nothing of a message came that a held one `waited` for. Its sender is told, and counts it:
-    /// counted here it would be there twice where its lifespan has ended on both sides.
-    fn note_given_up(&mut self, inbox: &mut Inbox<'_>, number: u32, waited: u32) {
-        if self.given_up.len() < MAX_GIVEN_UP {
-            self.given_up.insert(number);
-        } else if let Some(held) = self.held.get(&waited) {
-            inbox.dropped(held.message.frame.topic(), DropReason::ReassemblyTimeout);
         }
     }
 

@@ -67,7 +67,7 @@ impl ReceiveClass {
             }
         }
         for (number, reason) in gone {
-            self.drop_assembly(inbox, number, reason);
+            self.give_up(inbox, number, reason);
             self.settle(inbox, number);
         }
         let idle = self.assemblies.is_empty() && self.held.is_empty();

@@ -129,8 +129,7 @@ impl SendClass {
         }
     }
 
-    /// Drops what the receiver has given up without having seen any of it. It counts nothing of
-    /// that.
+    /// Drops what the receiver has given up before it was complete. It counts nothing of that.
     fn drop_given_up(&mut self, ctx: &mut SendContext<'_>, numbers: &[u32]) {
         for number in numbers {
             let Ok(at) = self.started.binary_search_by_key(number, |started| started.0) else {

@@ -210,6 +210,34 @@ fn lifespan_ends_at_both_ends() {
     sim.check_accounts();
 }
 
+#[test]
+fn a_large_message_that_grows_old_is_counted_once() {
+    for seed in seeds() {
+        let mut random = Random(seed);
+        let mut sim = Sim::new(seed, Weather::delay(20), &["edge/a", "fog/b"]);
+        sim.run_ms(1_500);
+        let loss = 0.1 + 0.3 * random.share();
+        let mut dice = Random(seed + 1);
+        // What is lost is messages alone: a peer that is down counts what it had of them. And
+        // nothing overtakes: a part that was given up would come after all.
+        sim.network.weather.delay = Duration::from_millis(1 + random.below(79));
+        sim.network.censor =
+            Some(Box::new(move |_, _, class, _| class == Priority::Bulk && dice.chance(loss)));
+        for _ in 0..60 {
+            let post = Post::large(1, 4_000).lifespan(Some(Duration::from_millis(90)));
+            sim.publish(0, 1, post).unwrap();
+            sim.run(random.duration(Duration::from_millis(100)));
+        }
+        sim.run_ms(3_000);
+        sim.check_accounts();
+        sim.check_deliveries();
+        let lane = &sim.nodes[0].lanes[&LaneId(1)];
+        let late: u64 = sim.nodes[1].receiver_dropped.values().sum();
+        let delivered = sim.sequences(1, 1).len() as u64;
+        assert_eq!(lane.out, delivered + late, "seed {seed}, loss {loss}: {lane:?}");
+    }
+}
+
 /// Loses all user datagrams of the first flow that hold a message of 700 bytes or more.
 fn lose_large_ones(sim: &mut Sim) {
     sim.network.censor = Some(Box::new(|from, _, class, datagram| {
