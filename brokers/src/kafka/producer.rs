@@ -103,6 +103,7 @@ impl Producer {
                 waker: ThreadWaker::default(),
                 room: Notify::new(),
                 fatal: AtomicBool::new(false),
+                warned: Mutex::new(None),
             }),
             handing_over: AtomicBool::new(false),
         };

@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_domain::DropReason;
+use parking_lot::Mutex;
 use rdkafka::ClientContext;
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
@@ -18,6 +19,9 @@ use crate::kafka::inner::Shared;
 use crate::kafka::topics::Topic;
 use crate::kafka::waker::ThreadWaker;
 use crate::outbox::{Fate, Receipt};
+
+/// Losses are said in the log that often at most; the counters have them all.
+const WARN_EVERY: Duration = Duration::from_secs(1);
 
 /// What comes back from librdkafka with the acknowledgement.
 pub(in crate::kafka) struct Delivery {
@@ -45,6 +49,8 @@ pub(in crate::kafka) struct WriteContext {
     /// Wakes the feeder.
     pub(in crate::kafka) room: Notify,
     pub(in crate::kafka) fatal: AtomicBool,
+    /// When a loss was last said in the log.
+    pub(in crate::kafka) warned: Mutex<Option<Instant>>,
     pub(in crate::kafka) shared: Arc<Shared>,
 }
 
@@ -128,8 +134,23 @@ impl WriteContext {
         if matches!(code, Some(RDKafkaErrorCode::Fatal)) {
             self.fatal.store(true, Ordering::Release);
         }
-        tracing::debug!(topic = %topic.name, %error, "a message was not taken");
-        Fate::Dropped(reason_of(code))
+        let reason = reason_of(code);
+        if reason == DropReason::BrokerError && self.is_warning_due() {
+            tracing::warn!(topic = %topic.name, %error, "Kafka did not take a message, it is lost");
+        } else {
+            tracing::debug!(topic = %topic.name, %error, ?reason, "a message was not taken");
+        }
+        Fate::Dropped(reason)
+    }
+
+    /// Whether the log has said nothing of losses for a while.
+    fn is_warning_due(&self) -> bool {
+        let (now, mut warned) = (Instant::now(), self.warned.lock());
+        let is_due = warned.is_none_or(|at| now - at >= WARN_EVERY);
+        if is_due {
+            *warned = Some(now);
+        }
+        is_due
     }
 }
 
