@@ -181,7 +181,7 @@ pub async fn readers_never_see_a_hole_while_history_is_trimmed(fixture: &dyn Fix
 /// loaded is right after each commit.
 pub async fn documents_are_right_whoever_tidies(fixture: &dyn Fixture) {
     const DOCUMENTS: u64 = 400;
-    let rounds = if crate::full() { 40 } else { 4 };
+    let rounds = if crate::full() { 12 } else { 4 };
     let name = store_name("tidied");
     let mut model = Model::new(fixture, "unused").await;
     model.store = fixture.open(&name).await;

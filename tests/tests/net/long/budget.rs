@@ -115,8 +115,9 @@ fn judge(
             );
             let allocated = &row["lanes"][0]["allocated_hz"];
             let allocated = allocated.as_f64().with_context(|| format!("{topic}: {allocated}"))?;
+            // A flow that is kept from the processor takes its link for a slower one.
             expect(
-                (allocated - given).abs() <= IMAGE_RATE * given,
+                allocated >= USED * given && allocated <= (1.0 + IMAGE_RATE) * given,
                 format!("{topic}: {allocated:.2} Hz are given out instead of {given:.2}"),
             );
         } else {
