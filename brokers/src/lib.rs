@@ -18,7 +18,7 @@ pub mod retained;
 mod wake;
 mod worker_side;
 
-pub use open::{OpenError, check_layer, open_layer, open_node};
+pub use open::{OpenError, layer_fault, node_schema, open_layer, open_node};
 pub use port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, ConsumerOffset, Content, FlowSide,
     Health, Later, PublishOutcome, Publisher, PublisherOptions, Received, Role, SubscribeOptions,

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use blaze_domain::node_file::{LayerBroker, NodeBroker};
+use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
+use blaze_runtime::config::{Schema, schema};
+use blaze_runtime::logs::check_level;
 
 use crate::dds::DdsError;
 use crate::dds::layer::DdsBroker;
@@ -31,12 +33,35 @@ pub enum OpenError {
     InProcess,
 }
 
-/// Whether the section of a layer scope holds together; connects nowhere and reads no files, so
-/// that a node file can be checked on another machine.
-///
-/// # Errors
-/// As [`open_layer`], but for adapters that live inside one process.
-pub fn check_layer(section: &LayerBroker) -> Result<(), OpenError> {
+/// The node file as a program with brokers reads it: with what the adapter has against the section
+/// of the layer scope, what the log has against its level, and what `check` has against the rest.
+/// Connects nowhere and reads no other file, so that a node file can be checked on another machine.
+pub fn node_schema(
+    check: impl Fn(&NodeFile) -> Vec<Fault> + Send + Sync + 'static,
+) -> Schema<NodeFile> {
+    schema(move |tree| {
+        let (file, warnings) = NodeFile::read(tree)?;
+        let mut faults = check(&file);
+        faults.extend(layer_fault(&file));
+        let level = check_level(&file.log.level).err();
+        faults.extend(level.map(|detail| Fault { path: "log.level".to_owned(), detail }));
+        if faults.is_empty() { Ok((file, warnings)) } else { Err(faults) }
+    })
+}
+
+/// What the adapter has against the section of the layer scope. One that was not built in, or that
+/// lives inside one process, is told at the start.
+#[must_use]
+pub fn layer_fault(file: &NodeFile) -> Option<Fault> {
+    match check_layer(file.brokers.layer.as_ref()?) {
+        Err(OpenError::Setting { key, reason }) => {
+            Some(Fault { path: format!("brokers.layer.{key}"), detail: reason })
+        }
+        Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
+    }
+}
+
+fn check_layer(section: &LayerBroker) -> Result<(), OpenError> {
     match section {
         LayerBroker::Memory => Ok(()),
         LayerBroker::Dds(dds) => DdsBroker::check(dds).map_err(|error| dds_error(&error)),

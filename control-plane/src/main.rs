@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
 
-use blaze_config::process::{Command, Setup, run};
-use blaze_domain::node_file::{Fault, NodeFile};
-use blaze_runtime::config::{Schema, Sources, load_typed, parse_override};
-use blaze_runtime::supervisor::{block_on, exit_code};
-use blaze_runtime::{forbid_core_dumps, logs, say};
+use blaze_config::process::{Command, NAME, Setup, run};
+use blaze_domain::node_file::NodeFile;
+use blaze_runtime::config::{Sources, load_or_say, parse_override, schema};
+use blaze_runtime::logs::{self, LogFormat};
+use blaze_runtime::supervisor::{block_on, exit_code, failed};
+use blaze_runtime::{forbid_core_dumps, say};
 use clap::{Parser, Subcommand};
 
 /// A commit makes and drops thousands of small texts and map nodes on other threads than it began
@@ -84,16 +84,10 @@ fn main() -> ExitCode {
         sources.search.clear();
         sources.file_may_be_absent = true;
     }
-    let loaded = match load_typed(&sources, &schema()) {
+    let loaded = match load_or_say(&sources, &schema(NodeFile::read), None) {
         Ok(loaded) => loaded,
-        Err(faults) => {
-            faults.iter().for_each(|fault| say(format_args!("{fault}")));
-            return ExitCode::from(exit_code::CONFIGURATION);
-        }
+        Err(code) => return code,
     };
-    for warning in &loaded.warnings {
-        say(format_args!("warning: {warning}"));
-    }
     let file = loaded.value;
     let named = loaded.document.value().pointer("/control_plane/store").is_some();
     let setup = Setup {
@@ -109,13 +103,9 @@ fn main() -> ExitCode {
     if arguments.check {
         return ExitCode::SUCCESS;
     }
-    let format = match file.log.format.as_str() {
-        "json" => logs::LogFormat::Json,
-        _ => logs::LogFormat::Text,
-    };
+    let format = if file.log.format.as_str() == "json" { LogFormat::Json } else { LogFormat::Text };
     if let Err(error) = logs::init(file.log.level.as_str(), format) {
-        say(format_args!("blaze-config failed: {error}"));
-        return ExitCode::from(exit_code::FAILED);
+        return failed(NAME, error);
     }
     let command = match arguments.command {
         None | Some(Task::Serve) => Command::Serve,
@@ -124,20 +114,5 @@ fn main() -> ExitCode {
         Some(Task::Restore { file }) => Command::Restore(file),
         Some(Task::Reencrypt) => Command::Reencrypt,
     };
-    match block_on(run(setup, command)) {
-        Ok(code) => code,
-        Err(error) => {
-            say(format_args!("blaze-config failed: {error}"));
-            ExitCode::from(exit_code::FAILED)
-        }
-    }
-}
-
-/// The node file as this program reads it.
-fn schema() -> Schema<NodeFile> {
-    let remark = |fault: Fault| (fault.path, fault.detail);
-    Arc::new(move |value| match NodeFile::read(value) {
-        Ok((file, warnings)) => Ok((file, warnings.into_iter().map(remark).collect())),
-        Err(faults) => Err(faults.into_iter().map(remark).collect()),
-    })
+    block_on(NAME, run(setup, command))
 }

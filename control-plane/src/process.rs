@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_domain::node_file::{ControlPlaneSection, StoreSection};
-use blaze_runtime::supervisor::{ShutdownSteps, Supervisor, TaskPolicy, exit_code};
+use blaze_runtime::supervisor::{ShutdownSteps, Supervisor, TaskPolicy, failed};
 use blaze_runtime::{ready_line, say};
 
 use crate::auth::Authenticator;
@@ -23,6 +23,8 @@ use crate::secrets::Keyring;
 use crate::store::migrate::Plan;
 use crate::store::{self, FullStore, StoreError, backup};
 
+/// Name of the program.
+pub const NAME: &str = "blaze-config";
 /// A shutdown takes at most this long.
 pub(crate) const SHUTDOWN: Duration = Duration::from_secs(10);
 
@@ -139,7 +141,7 @@ impl Keys {
 /// Does it, and gives what the process exits with.
 pub async fn run(setup: Setup, command: Command) -> ExitCode {
     install_crypto_provider();
-    let supervisor = Supervisor::new("blaze-config");
+    let supervisor = Supervisor::new(NAME);
     let result = match command {
         Command::Serve => return serve(&supervisor, setup).await,
         Command::Migrate { dry_run } => migrate(&supervisor, &setup, dry_run).await,
@@ -150,10 +152,7 @@ pub async fn run(setup: Setup, command: Command) -> ExitCode {
     supervisor.shutdown(SHUTDOWN).await;
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            say(format_args!("blaze-config failed: {error:#}"));
-            ExitCode::from(exit_code::FAILED)
-        }
+        Err(error) => failed(NAME, format_args!("{error:#}")),
     }
 }
 
@@ -254,10 +253,7 @@ pub(crate) fn all_of(faults: Vec<String>) -> anyhow::Error {
 async fn serve(supervisor: &Supervisor, setup: Setup) -> ExitCode {
     let main = match RunningMain::start(supervisor, setup).await {
         Ok(main) => Arc::new(main),
-        Err(error) => {
-            say(format_args!("blaze-config failed: {error:#}"));
-            return ExitCode::from(exit_code::FAILED);
-        }
+        Err(error) => return failed(NAME, format_args!("{error:#}")),
     };
     let (announced, stopping, failing) =
         (Arc::clone(&main), supervisor.stopping_token(), supervisor.clone());

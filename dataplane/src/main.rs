@@ -16,14 +16,15 @@ use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::world::LayerScopeId;
 use blaze_runtime::admin::Readiness;
-use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_typed, parse_override};
+use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_or_say, parse_override};
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{
-    ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code,
+    ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, failed,
 };
 use blaze_runtime::{environment, logs, ready_line, say, state};
 use clap::Parser;
 
+const NAME: &str = "blaze-flow";
 /// A shutdown takes at most this long.
 const SHUTDOWN: Duration = Duration::from_secs(5);
 
@@ -54,17 +55,10 @@ fn main() -> ExitCode {
     }
     let sources = Sources::of_process(arguments.config, overrides);
     let instance = environment::parsed::<InstanceName>("BLAZE_INSTANCE").err();
-    let loaded = match (load_typed(&sources, &schema()), instance) {
-        (Ok(loaded), None) => loaded,
-        (loaded, instance) => {
-            let faults = loaded.err().into_iter().flatten().chain(instance);
-            faults.for_each(|fault| say(format_args!("{fault}")));
-            return ExitCode::from(exit_code::CONFIGURATION);
-        }
+    let loaded = match load_or_say(&sources, &schema(), instance) {
+        Ok(loaded) => loaded,
+        Err(code) => return code,
     };
-    for warning in &loaded.warnings {
-        say(format_args!("warning: {warning}"));
-    }
     if cfg!(not(feature = "kafka"))
         && matches!(loaded.value.brokers.layer, Some(LayerSection::Kafka(_)))
     {
@@ -76,23 +70,14 @@ fn main() -> ExitCode {
     if arguments.check {
         return ExitCode::SUCCESS;
     }
-    match block_on(run(sources.pinned(), loaded)) {
-        Ok(code) => code,
-        Err(error) => {
-            say(format_args!("blaze-flow failed: {error}"));
-            ExitCode::from(exit_code::FAILED)
-        }
-    }
+    block_on(NAME, run(sources.pinned(), loaded))
 }
 
 async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
-    let supervisor = Supervisor::new("blaze-flow");
+    let supervisor = Supervisor::new(NAME);
     let (flow, log, service) = match begin(&supervisor, &loaded.value).await {
         Ok(started) => started,
-        Err(error) => {
-            say(format_args!("blaze-flow failed: {error:#}"));
-            return ExitCode::from(exit_code::FAILED);
-        }
+        Err(error) => return failed(NAME, format_args!("{error:#}")),
     };
     let followed = Followed { sources, loaded, watch: WatchSettings::default(), log: Some(log) };
     follow_node_file(&flow, followed, service.as_ref(), &supervisor, |_| {});

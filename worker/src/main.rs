@@ -8,17 +8,17 @@ use std::time::Duration;
 use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::redis::RedisKeys;
-use blaze_brokers::{Broker, OpenError, Role, check_layer, open_layer, open_node};
+use blaze_brokers::{Broker, Role, node_schema, open_layer, open_node};
 use blaze_domain::InstanceName;
-use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
+use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_runtime::admin::Readiness;
 use blaze_runtime::config::{
-    Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_typed,
+    Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_or_say,
     parse_override, watch_with,
 };
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{
-    ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code,
+    ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, failed,
 };
 use blaze_runtime::{environment, forbid_core_dumps, logs, ready_line, say, state};
 use blaze_worker::admin::Shown;
@@ -27,6 +27,7 @@ use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::{LocalBroker, WorkerSettings};
 use clap::Parser;
 
+const NAME: &str = "blaze-worker";
 /// A shutdown takes at most this long.
 const SHUTDOWN: Duration = Duration::from_secs(5);
 
@@ -59,65 +60,27 @@ fn main() -> ExitCode {
         overrides.push(("log.format".to_owned(), format.clone()));
     }
     let sources = Sources::of_process(arguments.config, overrides);
-    let instance = environment::parsed::<InstanceName>("BLAZE_INSTANCE");
-    let (loaded, instance) = match (load_typed(&sources, &schema()), instance) {
-        (Ok(loaded), Ok(instance)) => (loaded, instance.unwrap_or_else(InstanceName::first)),
-        (loaded, instance) => {
-            let faults = loaded.err().into_iter().flatten().chain(instance.err());
-            faults.for_each(|fault| say(format_args!("{fault}")));
-            return ExitCode::from(exit_code::CONFIGURATION);
-        }
+    let (instance, fault) = match environment::parsed::<InstanceName>("BLAZE_INSTANCE") {
+        Ok(instance) => (instance.unwrap_or_else(InstanceName::first), None),
+        Err(fault) => (InstanceName::first(), Some(fault)),
     };
-    for warning in &loaded.warnings {
-        say(format_args!("warning: {warning}"));
-    }
+    let loaded = match load_or_say(&sources, &schema(), fault) {
+        Ok(loaded) => loaded,
+        Err(code) => return code,
+    };
     if arguments.check {
         return ExitCode::SUCCESS;
     }
-    match block_on(run(sources.pinned(), loaded, instance)) {
-        Ok(code) => code,
-        Err(error) => {
-            say(format_args!("blaze-worker failed: {error}"));
-            ExitCode::from(exit_code::FAILED)
-        }
-    }
+    block_on(NAME, run(sources.pinned(), loaded, instance))
 }
 
 /// The node file as this program reads it.
 fn schema() -> Schema<NodeFile> {
-    let remark = |fault: Fault| (fault.path, fault.detail);
-    Arc::new(move |value| match NodeFile::read(value) {
-        Ok((file, warnings)) => {
-            let mut faults = WorkerSettings::of(&file).err().unwrap_or_default();
-            faults.extend(broker_fault(&file));
-            faults.extend(
-                logs::check_level(&file.log.level)
-                    .err()
-                    .map(|detail| Fault { path: "log.level".to_owned(), detail }),
-            );
-            if faults.is_empty() {
-                Ok((file, warnings.into_iter().map(remark).collect()))
-            } else {
-                Err(faults.into_iter().map(remark).collect())
-            }
-        }
-        Err(faults) => Err(faults.into_iter().map(remark).collect()),
-    })
-}
-
-/// What the adapter has against the section of the layer scope. What was not built in is told at
-/// the start.
-fn broker_fault(file: &NodeFile) -> Option<Fault> {
-    match check_layer(file.brokers.layer.as_ref()?) {
-        Err(OpenError::Setting { key, reason }) => {
-            Some(Fault { path: format!("brokers.layer.{key}"), detail: reason })
-        }
-        Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
-    }
+    node_schema(|file| WorkerSettings::of(file).err().unwrap_or_default())
 }
 
 async fn run(sources: Sources, loaded: Loaded<NodeFile>, instance: InstanceName) -> ExitCode {
-    let supervisor = Supervisor::new("blaze-worker");
+    let supervisor = Supervisor::new(NAME);
     match start(&supervisor, sources, loaded, instance).await {
         Ok((worker, readiness)) => {
             let steps = ShutdownSteps::new(SHUTDOWN)
@@ -125,10 +88,7 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>, instance: InstanceName)
                 .on(ShutdownPhase::Drain, "worker", async move { worker.drain().await });
             supervisor.run(steps).await
         }
-        Err(error) => {
-            say(format_args!("blaze-worker failed: {error:#}"));
-            ExitCode::from(exit_code::FAILED)
-        }
+        Err(error) => failed(NAME, format_args!("{error:#}")),
     }
 }
 

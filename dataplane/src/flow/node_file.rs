@@ -2,13 +2,13 @@
 
 use std::sync::Arc;
 
-use blaze_brokers::{OpenError, check_layer};
-use blaze_domain::node_file::{Fault, NodeFile};
+use blaze_brokers::node_schema;
+use blaze_domain::node_file::NodeFile;
 use blaze_runtime::config::{
     Follower, Keys, Loaded, LocatedFault, Schema, Sources, Verdict, WatchSettings, follow,
     load_typed, watch_with,
 };
-use blaze_runtime::logs::{self, LogHandle};
+use blaze_runtime::logs::LogHandle;
 use blaze_runtime::{Supervisor, TaskPolicy};
 use serde_json::Value;
 use tokio::sync::watch;
@@ -44,36 +44,7 @@ pub const KEYS: Keys = Keys {
 /// The node file as a flow reads it.
 #[must_use]
 pub fn schema() -> Schema<NodeFile> {
-    let remark = |fault: Fault| (fault.path, fault.detail);
-    Arc::new(move |value| match NodeFile::read(value) {
-        Ok((file, warnings)) => {
-            let mut faults = file.check_for_flow();
-            faults.extend(broker_fault(&file));
-            faults.extend(level_fault(&file));
-            if faults.is_empty() {
-                Ok((file, warnings.into_iter().map(remark).collect()))
-            } else {
-                Err(faults.into_iter().map(remark).collect())
-            }
-        }
-        Err(faults) => Err(faults.into_iter().map(remark).collect()),
-    })
-}
-
-/// What the adapter has against the section of the layer scope. What was not built in is told
-/// beside that.
-fn broker_fault(file: &NodeFile) -> Option<Fault> {
-    match check_layer(file.brokers.layer.as_ref()?) {
-        Err(OpenError::Setting { key, reason }) => {
-            Some(Fault { path: format!("brokers.layer.{key}"), detail: reason })
-        }
-        Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
-    }
-}
-
-fn level_fault(file: &NodeFile) -> Option<Fault> {
-    let detail = logs::check_level(&file.log.level).err()?;
-    Some(Fault { path: "log.level".to_owned(), detail })
+    node_schema(NodeFile::check_for_flow)
 }
 
 /// Whether a file differs from the one of the start in what a flow reads then alone.

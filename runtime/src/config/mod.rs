@@ -27,9 +27,12 @@ mod yaml;
 #[cfg(test)]
 mod yaml_documents_tests;
 
+use std::process::ExitCode;
 use std::sync::Arc;
 
 use serde_json::Value;
+
+use crate::supervisor::{exit_code, say};
 
 pub use document::{Document, MAX_FILE_BYTES, NamedText, Sources, parse_override};
 pub use follow::{Follower, Keys, follow};
@@ -75,6 +78,29 @@ pub fn load_typed<T>(
     schema: &Schema<T>,
 ) -> Result<Loaded<T>, Vec<LocatedFault>> {
     judge(Document::load_with_faults(sources), schema)
+}
+
+/// The same for a program that starts: every fault is told on stderr, those of `besides`, too, and
+/// so are the warnings.
+///
+/// # Errors
+/// The exit code of a faulty configuration.
+pub fn load_or_say<T>(
+    sources: &Sources,
+    schema: &Schema<T>,
+    besides: Option<LocatedFault>,
+) -> Result<Loaded<T>, ExitCode> {
+    match (load_typed(sources, schema), besides) {
+        (Ok(loaded), None) => {
+            loaded.warnings.iter().for_each(|warning| say(format_args!("warning: {warning}")));
+            Ok(loaded)
+        }
+        (loaded, besides) => {
+            let faults = loaded.err().into_iter().flatten().chain(besides);
+            faults.for_each(|fault| say(format_args!("{fault}")));
+            Err(ExitCode::from(exit_code::CONFIGURATION))
+        }
+    }
 }
 
 fn judge<T>(

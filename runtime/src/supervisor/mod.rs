@@ -24,7 +24,7 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-pub use process::{Signals, block_on, exit_code, say};
+pub use process::{Signals, block_on, exit_code, failed, say};
 pub use shutdown::{ShutdownPhase, ShutdownReport, ShutdownSteps};
 pub use task::{StopOnDrop, TaskEnd, TaskHandle, TaskInfo, TaskPolicy};
 

@@ -22,16 +22,23 @@ pub mod exit_code {
 /// Threads of the runtime that block get this long at the end of the process.
 const AFTER_MAIN: Duration = Duration::from_millis(500);
 
-/// Runs the main future of a process on a runtime of its own; what then still blocks a thread does
-/// not hold it up.
-///
-/// # Errors
-/// If the system gives no threads.
-pub fn block_on<F: Future>(main: F) -> std::io::Result<F::Output> {
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-    let output = runtime.block_on(main);
-    runtime.shutdown_timeout(AFTER_MAIN);
-    Ok(output)
+/// Runs the main future of the process `name` on a runtime of its own; what then still blocks a
+/// thread does not hold it up. A system that gives no threads is told on stderr.
+pub fn block_on(name: &str, main: impl Future<Output = ExitCode>) -> ExitCode {
+    match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => {
+            let code = runtime.block_on(main);
+            runtime.shutdown_timeout(AFTER_MAIN);
+            code
+        }
+        Err(error) => failed(name, error),
+    }
+}
+
+/// Says why the process `name` ends, and with which code.
+pub fn failed(name: &str, error: impl std::fmt::Display) -> ExitCode {
+    say(format_args!("{name} failed: {error}"));
+    ExitCode::from(exit_code::FAILED)
 }
 
 impl Supervisor {
@@ -42,8 +49,7 @@ impl Supervisor {
         let mut signals = match Signals::new() {
             Ok(signals) => signals,
             Err(error) => {
-                say(format_args!("{} failed: no signal handlers: {error}", self.name()));
-                return ExitCode::from(exit_code::FAILED);
+                return failed(self.name(), format_args!("no signal handlers: {error}"));
             }
         };
         let failure = tokio::select! {
@@ -54,7 +60,7 @@ impl Supervisor {
             reason = self.failed() => Some(reason),
         };
         if let Some(reason) = &failure {
-            say(format_args!("{} failed: {reason}", self.name()));
+            failed(self.name(), reason);
         }
         let report = tokio::select! {
             report = self.shutdown_with(steps) => report,
@@ -76,10 +82,7 @@ impl Supervisor {
         match (failure, self.failure()) {
             (None, None) => ExitCode::SUCCESS,
             (Some(_), _) => ExitCode::from(exit_code::FAILED),
-            (None, Some(reason)) => {
-                say(format_args!("{} failed: {reason}", self.name()));
-                ExitCode::from(exit_code::FAILED)
-            }
+            (None, Some(reason)) => failed(self.name(), reason),
         }
     }
 }

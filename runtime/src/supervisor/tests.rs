@@ -186,7 +186,7 @@ fn child_process() {
     let Some(scenario) = environment::variable(SCENARIO) else {
         return;
     };
-    let code = block_on(async {
+    let code = block_on("blaze-test", async {
         let supervisor = Supervisor::new("blaze-test");
         let token = supervisor.shutdown_token();
         supervisor.spawn("worker", TaskPolicy::Essential, async move { token.cancelled().await });
@@ -208,7 +208,7 @@ fn child_process() {
         let (code, ()) = futures_join(supervisor.run(steps), tell).await;
         code
     });
-    std::process::exit(if code.unwrap() == ExitCode::SUCCESS { 0 } else { 1 });
+    std::process::exit(if code == ExitCode::SUCCESS { 0 } else { 1 });
 }
 
 /// Both, the first polled first.

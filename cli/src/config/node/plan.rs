@@ -4,7 +4,7 @@
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 
-use blaze_brokers::{OpenError, check_layer};
+use blaze_brokers::layer_fault;
 use blaze_domain::node_file::{Fault, NodeFile};
 use blaze_worker::settings::WorkerSettings;
 use reqwest::Url;
@@ -246,11 +246,7 @@ fn faults(file: &Value) -> Vec<Fault> {
             faults.push(fault);
         }
     }
-    if let Some(Err(OpenError::Setting { key, reason })) =
-        read.brokers.layer.as_ref().map(check_layer)
-    {
-        faults.push(Fault { path: format!("brokers.layer.{key}"), detail: reason });
-    }
+    faults.extend(layer_fault(&read));
     faults
 }
 

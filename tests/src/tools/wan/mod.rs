@@ -59,7 +59,11 @@ pub(crate) struct Options {
 }
 
 pub(crate) fn run(options: Options) -> anyhow::Result<()> {
-    blaze_runtime::block_on(emulate(options))?
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    let ended = runtime.block_on(emulate(options));
+    // The threads that read and write packets do not end by themselves.
+    runtime.shutdown_background();
+    ended
 }
 
 async fn emulate(options: Options) -> anyhow::Result<()> {

@@ -82,7 +82,10 @@ fn taken(admin: &Admin) -> u64 {
 
 #[test]
 fn what_is_queued_arrives_before_the_goodbye() -> anyhow::Result<()> {
-    blaze_runtime::block_on(stop_with_a_full_queue())?
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    let stopped = runtime.block_on(stop_with_a_full_queue());
+    runtime.shutdown_background();
+    stopped
 }
 
 async fn stop_with_a_full_queue() -> anyhow::Result<()> {
