@@ -336,7 +336,8 @@ pub struct LinkCounters {
     pub stale: u64,
     /// Samples or messages that came again, or too late.
     pub duplicates: u64,
-    /// Unfinished messages whose parts never came.
+    /// Unfinished messages that were given up because parts of them did not come. Their senders
+    /// count them as dropped.
     pub reassembly_timeouts: u64,
     /// Unfinished messages that gave way because memory was full.
     pub reassembly_evicted: u64,

@@ -119,6 +119,7 @@ impl Engine {
                 });
             } else {
                 self.counters.reassembly_evicted += 1;
+                self.with_inbox(now, at, |peer, inbox| peer[class].refuse(inbox, record.message));
             }
         });
     }

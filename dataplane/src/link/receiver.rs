@@ -8,7 +8,8 @@
 //!
 //! Each message is settled once: delivered, dropped or given up. A settled one is never looked at
 //! again. What is dropped is counted here. What is given up before it was complete is counted by its
-//! sender, which is told of it: it may have given it up, too, or know what nothing came of by name.
+//! sender, which is told of it: it may have given it up, too, and knows the name also of one of which
+//! nothing came.
 
 mod settle;
 mod timing;

@@ -68,7 +68,7 @@ pub(crate) struct FeedbackView<'a> {
     pub highest_sequence: u64,
     /// First and count, ascending.
     pub missing: &'a [u64],
-    /// Messages of which nothing came and that the receiver does not wait for any more.
+    /// Messages that the receiver gave up before they were complete.
     pub given_up: &'a [u32],
     pub received_bytes: u64,
     pub window_bytes: u64,

@@ -20,7 +20,7 @@ use crate::kafka::topics::Topic;
 use crate::kafka::waker::ThreadWaker;
 use crate::outbox::{Fate, Receipt};
 
-/// Losses are said in the log that often at most; the counters have them all.
+/// What is lost with the client is said in the log that often at most; the counters have all.
 const WARN_EVERY: Duration = Duration::from_secs(1);
 
 /// What comes back from librdkafka with the acknowledgement.
@@ -102,7 +102,8 @@ impl WriteContext {
     /// A record is no longer with the client: it was delivered, or there is an error.
     pub(in crate::kafka) fn settle(&self, delivery: Delivery, error: Option<&KafkaError>) {
         let Delivery { topic, bytes, receipt, .. } = delivery;
-        let fate = error.map_or(Fate::Delivered, |error| self.failed(error, &topic));
+        let is_message = matches!(receipt, Sent::Message(_));
+        let fate = error.map_or(Fate::Delivered, |error| self.failed(error, &topic, is_message));
         match receipt {
             Sent::Message(receipt) => receipt.settle(fate),
             // Without a receiver the broker is closed.
@@ -116,7 +117,7 @@ impl WriteContext {
         }
     }
 
-    fn failed(&self, error: &KafkaError, topic: &Topic) -> Fate {
+    fn failed(&self, error: &KafkaError, topic: &Topic, is_message: bool) -> Fate {
         let code = error.rdkafka_error_code();
         if matches!(
             code,
@@ -135,8 +136,8 @@ impl WriteContext {
             self.fatal.store(true, Ordering::Release);
         }
         let reason = reason_of(code);
-        if reason == DropReason::BrokerError && self.is_warning_due() {
-            tracing::warn!(topic = %topic.name, %error, "Kafka did not take a message, it is lost");
+        if is_message && reason == DropReason::BrokerError && self.is_warning_due() {
+            tracing::warn!(topic = %topic.name, %error, "Kafka did not confirm a message, which is not sent again");
         } else {
             tracing::debug!(topic = %topic.name, %error, ?reason, "a message was not taken");
         }

@@ -3,7 +3,8 @@
 use blaze_domain::DropReason;
 use smallvec::SmallVec;
 
-use super::{Inbox, MAX_GIVEN_UP, MAX_MESSAGE_RANGES, ReceiveClass};
+use super::{GIVEN_UP_TOLD, Inbox, MAX_GIVEN_UP, MAX_MESSAGE_RANGES, ReceiveClass};
+use crate::link::assembly::Assembly;
 
 impl ReceiveClass {
     /// Notes that a message is delivered or given up, and hands out what waited for it.
@@ -43,8 +44,7 @@ impl ReceiveClass {
         }
     }
 
-    /// Everything below `floor` that has not come is given up: the sender is through with it, and
-    /// has counted it.
+    /// Everything below `floor` that has not come is given up, and counted by its sender.
     pub(super) fn give_up_below(&mut self, inbox: &mut Inbox<'_>, floor: u64) {
         if floor <= self.message_floor {
             return;
@@ -104,14 +104,24 @@ impl ReceiveClass {
         }
     }
 
-    /// Gives up an unfinished message. It is to be settled.
+    /// Gives up an unfinished message. It is to be settled. Its sender is told, unless there are too
+    /// many: one that waits to be told is taken for delivered if its parts come after all.
     pub(super) fn give_up(&mut self, inbox: &mut Inbox<'_>, number: u32, reason: DropReason) {
-        if self.given_up.len() >= MAX_GIVEN_UP {
+        if self.given_up.len() >= GIVEN_UP_TOLD {
             self.drop_assembly(inbox, number, reason);
         } else if self.remove_assembly(number).is_some() {
-            inbox.counters.reassembly_timeouts +=
-                u64::from(reason == DropReason::ReassemblyTimeout);
+            let is_timeout = reason == DropReason::ReassemblyTimeout;
+            inbox.counters.reassembly_timeouts += u64::from(is_timeout);
             self.given_up.insert(number);
+        }
+    }
+
+    /// There is no memory for a part that its sender will not send again: the message is over.
+    pub(crate) fn refuse(&mut self, inbox: &mut Inbox<'_>, number: u32) {
+        if !self.is_settled(number) && !self.held.contains_key(&number) {
+            let assembly = self.remove_assembly(number);
+            inbox.dropped(assembly.as_ref().map_or("", Assembly::topic), DropReason::QueueFull);
+            self.settle(inbox, number);
         }
     }
 
