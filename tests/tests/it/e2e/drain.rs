@@ -84,6 +84,7 @@ fn taken(admin: &Admin) -> u64 {
 fn what_is_queued_arrives_before_the_goodbye() -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let stopped = runtime.block_on(stop_with_a_full_queue());
+    // All has ended that was to end; a thread that hangs is not waited for.
     runtime.shutdown_background();
     stopped
 }
