@@ -44,10 +44,10 @@ pub use many::{
     readers_never_see_a_hole_while_history_is_trimmed,
 };
 pub use trimming::{
-    a_long_history_is_trimmed, a_writer_that_slept_through_a_trim_is_refused,
-    every_revision_from_the_floor_on_can_be_told, many_commits_of_others_hide_no_version,
-    the_floor_rises_and_commits_go, versions_that_hold_or_are_young_stay,
-    what_outlives_a_commit_stays,
+    a_clock_that_leaps_ahead_makes_nothing_expire_at_once, a_long_history_is_trimmed,
+    a_writer_that_slept_through_a_trim_is_refused, every_revision_from_the_floor_on_can_be_told,
+    many_commits_of_others_hide_no_version, the_floor_rises_and_commits_go,
+    versions_that_hold_or_are_young_stay, what_outlives_a_commit_stays,
 };
 pub use upkeep::{
     a_backup_is_restored_elsewhere, a_closed_store_is_unavailable, documents_are_rewritten_in_place,
@@ -104,6 +104,7 @@ rules!(
     versions_that_hold_or_are_young_stay,
     what_outlives_a_commit_stays,
     a_long_history_is_trimmed,
+    a_clock_that_leaps_ahead_makes_nothing_expire_at_once,
     many_commits_of_others_hide_no_version,
     every_revision_from_the_floor_on_can_be_told,
     a_writer_that_slept_through_a_trim_is_refused,

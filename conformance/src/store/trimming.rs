@@ -1,8 +1,12 @@
 //! What goes and what stays when history is trimmed.
 
+use std::time::Duration;
+
+use blaze_domain::config::Timestamp;
+
 use super::Fixture;
 use super::samples::{self, record};
-use super::tools::{Dice, Model, commit, conflict, log};
+use super::tools::{Dice, Model, commit, conflict, log, store_name};
 use blaze_config::store::AuditQuery;
 use blaze_config::store::upkeep::now;
 
@@ -209,4 +213,35 @@ pub async fn a_writer_that_slept_through_a_trim_is_refused(fixture: &dyn Fixture
     }
     model.write(&[&["b"]]).await;
     model.check_now().await;
+}
+
+/// The time by which records expire follows the clock in steps, also over lives of the process, and
+/// at once where that goes back. What is young by it stays.
+pub async fn a_clock_that_leaps_ahead_makes_nothing_expire_at_once(fixture: &dyn Fixture) {
+    const HOUR: Duration = Duration::from_secs(3_600);
+    let start = now();
+    let at = |time: Duration| {
+        let ms = i64::try_from(time.as_millis()).unwrap_or(i64::MAX);
+        Timestamp::from_millis(start.as_millis() + ms)
+    };
+    let (future, name) = (at(500 * 24 * HOUR), store_name("leap"));
+    {
+        let store = fixture.open(&name).await;
+        assert_eq!(store.expiry_time(start, Duration::ZERO).await.unwrap(), start, "at first");
+        store.append_audit(&[samples::audit("trim", None)]).await.unwrap();
+        assert_eq!(store.expiry_time(future, HOUR).await.unwrap(), at(HOUR), "one step");
+        store.close().await;
+    }
+    let store = fixture.open(&name).await;
+    assert_eq!(store.expiry_time(future, HOUR).await.unwrap(), at(2 * HOUR), "another life");
+    store.trim(0, 1).await.unwrap();
+    let query = AuditQuery { limit: 10, ..AuditQuery::default() };
+    assert_eq!(store.audit(&query).await.unwrap().len(), 1, "entries of the audit");
+    assert_eq!(store.expiry_time(at(HOUR), HOUR).await.unwrap(), at(HOUR), "the clock is right");
+    drop(store);
+    // Before it was ever moved on, the newest commit says what time it was.
+    let mut model = Model::new(fixture, "leap-at-first").await;
+    model.write(&[&["a"]]).await;
+    let newest = model.commits[0].time;
+    assert_eq!(model.store.expiry_time(future, Duration::ZERO).await.unwrap(), newest);
 }

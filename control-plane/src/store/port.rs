@@ -10,6 +10,7 @@ use async_trait::async_trait;
 use blaze_domain::config::state::Step;
 use blaze_domain::config::{Document, Key, Timestamp};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// What a change did to a document.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -339,6 +340,15 @@ pub trait Archive: Send + Sync + 'static {
     /// # Errors
     /// [`StoreError`].
     async fn trim(&self, floor: u64, keep_versions: u32) -> Result<u64, StoreError>;
+
+    /// Moves on the time by which records expire and returns it: `clock`, but at most `most` after
+    /// the time before, which another process may have left. At first that is the time of the
+    /// newest commit. A clock that is far ahead for a while makes nothing expire at once.
+    /// [`Self::trim`] goes by the last one, and by the clock where there is none.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    async fn expiry_time(&self, clock: Timestamp, most: Duration) -> Result<Timestamp, StoreError>;
 
     /// Does what can wait, in small parts. To be called about once a second; nothing but time is
     /// lost without.

@@ -1,6 +1,14 @@
 //! Which versions of a document stay when history is trimmed.
 
+use std::time::Duration;
+
 use serde::{Deserialize, Serialize};
+
+/// The time by which records expire, in ms: `clock`, but at most `most` after the one before.
+pub(crate) fn expiry_time(clock: i64, before: Option<i64>, most: Duration) -> i64 {
+    let most = i64::try_from(most.as_millis()).unwrap_or(i64::MAX);
+    before.map_or(clock, |before| clock.min(before.saturating_add(most)))
+}
 
 /// How far history was trimmed: a document is looked at again only when it may have versions to
 /// spare since then.
@@ -77,6 +85,16 @@ mod tests {
             let newest = revisions.len().min(usize::try_from(keep).unwrap());
             prop_assert_eq!(&left[..newest], &revisions[..newest]);
         }
+    }
+
+    #[test]
+    fn a_clock_that_leaps_ahead_is_followed_step_by_step() {
+        let step = Duration::from_millis(10);
+        assert_eq!(expiry_time(5_000, None, step), 5_000);
+        assert_eq!(expiry_time(5_000, Some(100), step), 110);
+        assert_eq!(expiry_time(105, Some(100), step), 105);
+        assert_eq!(expiry_time(50, Some(100), step), 50, "it was ahead, and is right again");
+        assert_eq!(expiry_time(i64::MAX, Some(i64::MAX), Duration::MAX), i64::MAX);
     }
 
     #[test]

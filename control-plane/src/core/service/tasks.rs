@@ -9,7 +9,7 @@ use blaze_runtime::supervisor::TaskPolicy;
 use blaze_runtime::{CheckStatus, Gate, Readiness, Supervisor};
 use rand::RngExt as _;
 use tokio::sync::mpsc;
-use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::super::barrier::Looks;
 use super::super::committer::{Committer, follow, now, unavailable};
@@ -23,6 +23,11 @@ const HEALTH: Duration = Duration::from_millis(700);
 const LOOK: Duration = Duration::from_millis(1200);
 /// Between two readings of revoked tokens: they are refused everywhere within five seconds.
 const TOKENS: Duration = Duration::from_secs(2);
+/// How much faster than time itself the time may go on by which records expire: after 30 days
+/// without the service, it has caught up in a little more than a day.
+const EXPIRY_PACE: u32 = 24;
+/// From this on the clock counts as far ahead: a day.
+const LEAP_MS: i64 = 24 * 3_600 * 1_000;
 /// Between two tidyings of the store.
 const TIDY: Duration = Duration::from_secs(1);
 /// Pause of the follower after a failure, full jitter.
@@ -36,6 +41,22 @@ pub(super) struct Parts {
     pub(super) denials: mpsc::Receiver<Denial>,
     pub(super) history: HistorySection,
     pub(super) readiness: Readiness,
+}
+
+/// Says in the log that the clock is far ahead of the time by which records expire, once until it
+/// is not any more. Whether it is.
+fn note_leap(time: Timestamp, was_ahead: bool) -> bool {
+    let ahead_ms = now().as_millis().saturating_sub(time.as_millis());
+    let is_ahead = ahead_ms > LEAP_MS;
+    if is_ahead && !was_ahead {
+        tracing::warn!(
+            hours = ahead_ms / 3_600_000,
+            "the clock is far ahead of the last trimming: the service was away for long, or the \
+                clock is wrong; history, audit and answers expire 24 times faster than time goes \
+                until that is caught up"
+        );
+    }
+    is_ahead
 }
 
 impl ConfigService {
@@ -125,22 +146,36 @@ impl ConfigService {
         let mut ticks = interval(Duration::from_secs(u64::from(history.trim_period_s)));
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         ticks.tick().await;
+        let (mut moved, mut most, mut is_ahead) = (Instant::now(), Duration::ZERO, false);
         loop {
-            ticks.tick().await;
-            if let Err(error) = self.trim_old(&history).await {
-                tracing::warn!(%error, "old history was not removed");
+            // At the start, too: what others trim goes by it.
+            match self.inner.store.expiry_time(now(), most).await {
+                Ok(time) => {
+                    moved = Instant::now();
+                    is_ahead = note_leap(time, is_ahead);
+                    let trimmed = match most.is_zero() {
+                        true => Ok(()),
+                        false => self.trim_old(&history, time).await,
+                    };
+                    if let Err(error) = trimmed {
+                        tracing::warn!(%error, "old history was not removed");
+                    }
+                }
+                Err(error) => tracing::warn!(%error, "old history was not removed"),
             }
+            ticks.tick().await;
+            most = moved.elapsed() * EXPIRY_PACE;
         }
     }
 
-    /// Removes what is both too old and too far back.
-    async fn trim_old(&self, history: &HistorySection) -> Result<(), StoreError> {
+    /// Removes what is both too old, at a time, and too far back.
+    async fn trim_old(&self, history: &HistorySection, time: Timestamp) -> Result<(), StoreError> {
         let by_count = self.revision().saturating_sub(history.keep_revisions);
         if by_count <= self.inner.log.floor() {
             return self.remove_expired(history).await;
         }
         let keep = i64::try_from(history.keep_s).unwrap_or(i64::MAX).saturating_mul(1000);
-        let before = Timestamp::from_millis(now().as_millis().saturating_sub(keep));
+        let before = Timestamp::from_millis(time.as_millis().saturating_sub(keep));
         let by_age = self.inner.store.revision_before(before).await?;
         let floor = by_count.min(by_age);
         if floor > self.inner.log.floor() {

@@ -62,6 +62,10 @@ impl Archive for Silent {
         self.0.trim(floor, keep_versions).await
     }
 
+    async fn expiry_time(&self, clock: Timestamp, most: Duration) -> Result<Timestamp, StoreError> {
+        self.0.expiry_time(clock, most).await
+    }
+
     async fn revision_before(&self, time: Timestamp) -> Result<u64, StoreError> {
         self.0.revision_before(time).await
     }

@@ -421,7 +421,7 @@ fn only_of(condition: &Document) -> Document {
 }
 
 /// When a record wrote a revision; none if it is not in it.
-fn time_in(record: &Document, revision: i64) -> Result<Option<i64>, StoreError> {
+pub(super) fn time_in(record: &Document, revision: i64) -> Result<Option<i64>, StoreError> {
     let first = rows::integer(record, "_id")?;
     let place = usize::try_from(revision - first).unwrap_or(usize::MAX);
     let commit = rows::members(record, "commits").nth(place).transpose()?;

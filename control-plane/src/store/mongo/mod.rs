@@ -319,6 +319,10 @@ impl Archive for MongoStore {
         self.trim_to(floor, keep_versions).await
     }
 
+    async fn expiry_time(&self, clock: Timestamp, most: Duration) -> Result<Timestamp, StoreError> {
+        self.move_expiry(clock.as_millis(), most).await.map(Timestamp::from_millis)
+    }
+
     async fn revision_before(&self, time: Timestamp) -> Result<u64, StoreError> {
         self.find_revision_before(time).await
     }

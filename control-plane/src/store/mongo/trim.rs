@@ -10,9 +10,11 @@
 //! floor they take from the copies alone.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
 
 use mongodb::bson::{Document, doc};
 
+use super::archive::time_in;
 use super::client::{LONG, USUAL, limited};
 use super::fold::advance;
 use super::read::Part;
@@ -20,11 +22,13 @@ use super::rows::{Guard, Record};
 use super::statements::{RECORD_COMMITS, update_command};
 use super::{MongoStore, collect_within, rows};
 use crate::store::encode::{signed, unsigned};
-use crate::store::retain::{Trimmed, to_spare};
+use crate::store::retain::{self, Trimmed, to_spare};
 use crate::store::rows::VersionRow;
 use crate::store::upkeep::now;
 use crate::store::{AUDIT_KEPT_MS, READ_BYTES, StoreError};
 
+/// Where the time by which records expire is kept.
+const EXPIRY: &str = "expiry";
 /// Records that one step moves, and versions that one command removes.
 const STEP: usize = 1_000;
 /// Documents whose versions are looked for at once.
@@ -44,9 +48,10 @@ impl MongoStore {
     pub(super) async fn trim_to(&self, floor: u64, keep: u32) -> Result<u64, StoreError> {
         let head = signed(self.read_head().await?);
         let wanted = signed(floor).min(head);
+        let expiry = self.expiry().await?.unwrap_or_else(|| now().as_millis());
         let mut guard = self.fold_until(wanted).await?;
         while guard.floor < wanted {
-            self.move_some(guard, wanted, keep).await?;
+            self.move_some(guard, wanted, keep, expiry).await?;
             guard = self.read_guard().await?;
         }
         let now = Trimmed { floor: guard.floor, head, keep };
@@ -56,12 +61,18 @@ impl MongoStore {
     }
 
     /// One step. If another process was faster, it has done nothing.
-    async fn move_some(&self, guard: Guard, wanted: i64, keep: u32) -> Result<(), StoreError> {
+    async fn move_some(
+        &self,
+        guard: Guard,
+        wanted: i64,
+        keep: u32,
+        expiry: i64,
+    ) -> Result<(), StoreError> {
         let part = Part { after: guard.floor, records: STEP, bytes: READ_BYTES, whole: true };
         let (records, _) = self.read_records(part).await?;
         let floor = records.last().map_or(wanted, |record| record.last.min(wanted));
         let mut commands = vec![advance(guard.not_raised(floor), doc! { rows::FLOOR: floor })];
-        commands.extend(copies(records, guard.floor, floor, keep));
+        commands.extend(copies(records, (guard.floor, floor), keep, expiry));
         self.guarded(commands).await?;
         Ok(())
     }
@@ -228,6 +239,33 @@ impl MongoStore {
         Ok(keys)
     }
 
+    /// Moves on the time by which records expire.
+    pub(super) async fn move_expiry(&self, clock: i64, most: Duration) -> Result<i64, StoreError> {
+        let before = match self.expiry().await? {
+            None => self.newest_time().await?,
+            before => before,
+        };
+        let time = retain::expiry_time(clock, before, most);
+        let set = doc! { "$set": { "time": time } };
+        let set = self.tables.meta.update_one(doc! { "_id": EXPIRY }, set).upsert(true);
+        limited(USUAL, set).await?;
+        Ok(time)
+    }
+
+    async fn expiry(&self) -> Result<Option<i64>, StoreError> {
+        let found = limited(USUAL, self.tables.meta.find_one(doc! { "_id": EXPIRY })).await?;
+        found.map(|found| rows::integer(&found, "time")).transpose()
+    }
+
+    /// Time of the newest commit.
+    async fn newest_time(&self) -> Result<Option<i64>, StoreError> {
+        let find = self.tables.events.find_one(doc! {}).sort(doc! { "_id": -1 });
+        let find = find.projection(doc! { "commits.time": 1, "last": 1 });
+        let Some(record) = limited(USUAL, find).await? else { return Ok(None) };
+        let last = rows::integer(&record, "last")?;
+        time_in(&record, last)
+    }
+
     async fn write_note(&self, done: Trimmed) -> Result<(), StoreError> {
         let note = doc! { "$set": { "floor": done.floor, "head": done.head,
         "keep": i64::from(done.keep) } };
@@ -243,9 +281,9 @@ impl MongoStore {
     }
 }
 
-/// Commands that copy what outlives the commits above one revision and up to another.
-fn copies(records: Vec<Record>, above: i64, until: i64, keep: u32) -> Vec<Document> {
-    let now = now().as_millis();
+/// Commands that copy what outlives the commits above one revision and up to another. What has
+/// expired at `now` does not.
+fn copies(records: Vec<Record>, (above, until): (i64, i64), keep: u32, now: i64) -> Vec<Document> {
     let mut tables: BTreeMap<&str, Vec<Document>> = BTreeMap::new();
     let mut versions = Vec::new();
     for record in records {

@@ -37,9 +37,9 @@ pub(super) fn commit(
 }
 
 fn insert(transaction: &Transaction<'_>, group: &[EncodedCommit]) -> Result<(), CommitError> {
-    let mut event = transaction.prepare(&rows::insert_event()).map_err(not_written)?;
-    let mut version = transaction.prepare(&rows::insert_version()).map_err(not_written)?;
-    let mut audit = transaction.prepare(&rows::insert_audit()).map_err(not_written)?;
+    let mut event = transaction.prepare_cached(&rows::insert_event()).map_err(not_written)?;
+    let mut version = transaction.prepare_cached(&rows::insert_version()).map_err(not_written)?;
+    let mut audit = transaction.prepare_cached(&rows::insert_audit()).map_err(not_written)?;
     for commit in group {
         rows::bind_event(&mut event, &commit.event).map_err(not_written)?;
         for row in &commit.versions {
@@ -49,15 +49,16 @@ fn insert(transaction: &Transaction<'_>, group: &[EncodedCommit]) -> Result<(), 
             rows::bind_audit(&mut audit, row).map_err(not_written)?;
         }
         if let Some(row) = &commit.idempotency {
-            let mut put = transaction.prepare(&rows::put_idempotency()).map_err(not_written)?;
+            let mut put =
+                transaction.prepare_cached(&rows::put_idempotency()).map_err(not_written)?;
             if rows::bind_idempotency(&mut put, row, commit.event.time).map_err(not_written)? == 0 {
                 return Err(CommitError::Conflict);
             }
         }
     }
-    let mut put = transaction.prepare(rows::PUT_DOCUMENT).map_err(not_written)?;
+    let mut put = transaction.prepare_cached(rows::PUT_DOCUMENT).map_err(not_written)?;
     let mut delete =
-        transaction.prepare("DELETE FROM documents WHERE key = ?1").map_err(not_written)?;
+        transaction.prepare_cached("DELETE FROM documents WHERE key = ?1").map_err(not_written)?;
     for (key, row) in last_versions(group.iter().flat_map(|commit| &commit.versions)) {
         let done = match row.is_deletion() {
             true => delete.execute([key]),

@@ -206,10 +206,9 @@ pub(super) fn bootstrap(connection: &mut Connection) -> Result<(), StoreError> {
 
 /// A number of `meta`; 0 if it is not there.
 pub(super) fn number(connection: &Connection, name: &str) -> Result<i64, StoreError> {
-    let found = connection
-        .query_row("SELECT value FROM meta WHERE name = ?1", [name], |row| row.get(0))
-        .optional()
-        .map_err(store_error)?;
+    let mut find =
+        connection.prepare_cached("SELECT value FROM meta WHERE name = ?1").map_err(store_error)?;
+    let found = find.query_row([name], |row| row.get(0)).optional().map_err(store_error)?;
     Ok(found.unwrap_or(0))
 }
 
@@ -238,8 +237,8 @@ pub(super) fn store_id(connection: &Connection) -> Result<String, StoreError> {
 
 /// The newest revision: that of the last commit, or the floor if all commits up to it are gone.
 pub(super) fn head(connection: &Connection) -> Result<i64, StoreError> {
-    let newest: Option<i64> = connection
-        .query_row("SELECT max(revision) FROM events", [], |row| row.get(0))
-        .map_err(store_error)?;
+    let mut find =
+        connection.prepare_cached("SELECT max(revision) FROM events").map_err(store_error)?;
+    let newest: Option<i64> = find.query_row([], |row| row.get(0)).map_err(store_error)?;
     Ok(newest.unwrap_or(0).max(number(connection, "floor")?))
 }

@@ -25,6 +25,7 @@ mod upkeep;
 mod worker;
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_domain::config::{Document, Key, Timestamp};
@@ -285,9 +286,16 @@ impl Archive for SqliteStore {
                 .await?;
         }
         self.write(move |connection| trim::note(connection, now_trimmed)).await?;
-        let time = now().as_millis();
+        let clock = now().as_millis();
+        let time = self.write(move |connection| trim::expiry(connection, clock)).await?;
         while self.write(move |connection| trim::remove_expired(connection, time)).await? {}
         super::encode::unsigned(now_trimmed.floor)
+    }
+
+    async fn expiry_time(&self, clock: Timestamp, most: Duration) -> Result<Timestamp, StoreError> {
+        let clock = clock.as_millis();
+        let time = self.write(move |connection| trim::move_expiry(connection, clock, most)).await?;
+        Ok(Timestamp::from_millis(time))
     }
 
     async fn tidy(&self) -> Result<(), StoreError> {

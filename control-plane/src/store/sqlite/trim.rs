@@ -1,15 +1,20 @@
 //! Removing what nobody needs any more, in steps small enough for commits to go on between them.
 
+use std::time::Duration;
+
 use rusqlite::{Connection, OptionalExtension as _, TransactionBehavior};
 
 use super::connection::{head, number, set_number};
 use super::errors::store_error;
 use crate::store::encode::signed;
-use crate::store::retain::{Trimmed, to_spare};
+use crate::store::retain::{self, Trimmed, to_spare};
 use crate::store::{AUDIT_KEPT_MS, StoreError, TOKEN_KEPT_MS};
 
 /// Rows that one step removes.
 const ROWS: i64 = 1_000;
+
+/// The time by which records expire, among the numbers of `meta`.
+const EXPIRY: &str = "expiry_time";
 
 /// The floor as it now is, and which documents may have versions to spare.
 pub(super) struct Work {
@@ -83,6 +88,37 @@ pub(super) fn remove_versions(
         }
     }
     transaction.commit().map_err(store_error)
+}
+
+/// Moves on the time by which records expire.
+pub(super) fn move_expiry(
+    connection: &Connection,
+    clock: i64,
+    most: Duration,
+) -> Result<i64, StoreError> {
+    let before = match number(connection, EXPIRY)? {
+        0 => newest(connection)?,
+        before => Some(before),
+    };
+    let time = retain::expiry_time(clock, before, most);
+    set_number(connection, EXPIRY, time)?;
+    Ok(time)
+}
+
+/// The time by which records expire; that of the clock where it was never moved on.
+pub(super) fn expiry(connection: &Connection, clock: i64) -> Result<i64, StoreError> {
+    match number(connection, EXPIRY)? {
+        0 => Ok(clock),
+        time => Ok(time),
+    }
+}
+
+/// Time of the newest commit.
+fn newest(connection: &Connection) -> Result<Option<i64>, StoreError> {
+    connection
+        .query_row("SELECT time FROM events ORDER BY revision DESC LIMIT 1", [], |row| row.get(0))
+        .optional()
+        .map_err(store_error)
 }
 
 /// Removes some of what has expired; `false` when there is no more.
