@@ -28,7 +28,7 @@ const MAX_IDEMPOTENCY_KEY: usize = 128;
 pub(super) enum Tags {
     /// `*`.
     Any,
-    /// Revisions of the strong tags that are revisions; others match nothing.
+    /// Revisions of the tags that are revisions; others match nothing.
     Revisions(Vec<u64>),
 }
 
@@ -37,20 +37,21 @@ pub(super) fn etag(revision: u64) -> String {
     format!("\"{revision}\"")
 }
 
-/// `If-Match`.
+/// `If-Match`: weak tags match nothing (RFC 9110, 13.1.1).
 ///
 /// # Errors
 /// `invalid_header`.
 pub(super) fn if_match(headers: &HeaderMap) -> Result<Option<Tags>, Problem> {
-    tags(headers, &IF_MATCH, "If-Match")
+    tags(headers, &IF_MATCH, "If-Match", Weak::Ignored)
 }
 
-/// `If-None-Match`.
+/// `If-None-Match`: weak tags match as strong ones do (RFC 9110, 13.1.2), as caches and proxies that
+/// compress make them.
 ///
 /// # Errors
 /// `invalid_header`.
 pub(super) fn if_none_match(headers: &HeaderMap) -> Result<Option<Tags>, Problem> {
-    tags(headers, &IF_NONE_MATCH, "If-None-Match")
+    tags(headers, &IF_NONE_MATCH, "If-None-Match", Weak::Taken)
 }
 
 /// What a change of an existing document insists on.
@@ -81,7 +82,19 @@ pub(super) fn put_precondition(headers: &HeaderMap) -> Result<Precondition, Prob
     }
 }
 
-fn tags(headers: &HeaderMap, name: &HeaderName, shown: &str) -> Result<Option<Tags>, Problem> {
+/// What becomes of weak tags.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Weak {
+    Ignored,
+    Taken,
+}
+
+fn tags(
+    headers: &HeaderMap,
+    name: &HeaderName,
+    shown: &str,
+    weak: Weak,
+) -> Result<Option<Tags>, Problem> {
     let mut text = String::new();
     for value in headers.get_all(name) {
         let value = value
@@ -95,14 +108,14 @@ fn tags(headers: &HeaderMap, name: &HeaderName, shown: &str) -> Result<Option<Ta
     if !headers.contains_key(name) {
         return Ok(None);
     }
-    parse_tags(&text).map(Some).map_err(|reason| {
+    parse_tags(&text, weak).map(Some).map_err(|reason| {
         invalid(format!(
             "{shown} {reason}; it is *, or quoted revisions as they come in ETag: \"412\", \"413\""
         ))
     })
 }
 
-fn parse_tags(text: &str) -> Result<Tags, &'static str> {
+fn parse_tags(text: &str, weak: Weak) -> Result<Tags, &'static str> {
     let blank = |c: char| c == ' ' || c == '\t';
     let mut rest = text.trim_matches(blank);
     if rest == "*" {
@@ -110,7 +123,7 @@ fn parse_tags(text: &str) -> Result<Tags, &'static str> {
     }
     let mut revisions = Vec::new();
     loop {
-        let (weak, tag) = match rest.strip_prefix("W/") {
+        let (is_weak, tag) = match rest.strip_prefix("W/") {
             Some(tag) => (true, tag),
             None => (false, rest),
         };
@@ -119,7 +132,7 @@ fn parse_tags(text: &str) -> Result<Tags, &'static str> {
         if !inner.bytes().all(|byte| byte.is_ascii_graphic()) {
             return Err("holds a character that no tag has");
         }
-        if !weak {
+        if !is_weak || weak == Weak::Taken {
             revisions.extend(revision(inner));
         }
         rest = after.trim_start_matches(blank);
@@ -241,6 +254,15 @@ mod tests {
     }
 
     #[test]
+    fn weak_tags_tell_what_is_known_and_are_no_precondition() {
+        let weak = |name| headers(&[(name, "W/\"412\", \"413\"")]);
+        let of = |revisions: &[u64]| Ok(Some(Tags::Revisions(revisions.to_vec())));
+        let code = |problem: Problem| problem.code;
+        assert_eq!(if_none_match(&weak("if-none-match")).map_err(code), of(&[412, 413]));
+        assert_eq!(if_match(&weak("if-match")).map_err(code), of(&[413]));
+    }
+
+    #[test]
     fn put_may_insist_on_absence() {
         let read = |pairs: &[(&str, &str)]| {
             put_precondition(&headers(pairs)).map_err(|problem| problem.code)
@@ -289,7 +311,7 @@ mod tests {
             .unsigned_abs(), 1..8)) {
             let text =
                 revisions.iter().map(|revision| etag(*revision)).collect::<Vec<_>>().join(", ");
-            prop_assert_eq!(parse_tags(&text), Ok(Tags::Revisions(revisions)));
+            prop_assert_eq!(parse_tags(&text, Weak::Ignored), Ok(Tags::Revisions(revisions)));
         }
 
         #[test]
