@@ -119,7 +119,7 @@ pub(super) async fn keep(shared: Arc<Shared>, line: Line) {
 async fn attempt(shared: &Shared, line: Line) -> Failure {
     let session = match connect(shared, line).await {
         Ok(session) => session,
-        Err(error) => return error.into(),
+        Err(failure) => return failure,
     };
     shared.put_connection(line, Some(session.connection.clone()));
     let served = async {
@@ -137,7 +137,7 @@ async fn attempt(shared: &Shared, line: Line) -> Failure {
     }
 }
 
-async fn connect(shared: &Shared, line: Line) -> RedisResult<Session> {
+async fn connect(shared: &Shared, line: Line) -> Result<Session, Failure> {
     let liveness = Arc::<Liveness>::default();
     let pushes = Pushes {
         state: Arc::clone(&shared.state),
@@ -151,7 +151,7 @@ async fn connect(shared: &Shared, line: Line) -> RedisResult<Session> {
         .set_response_timeout(None)
         .set_pipeline_buffer_size(LIBRARY_QUEUE)
         .set_push_sender(pushes);
-    let client = &shared.settings.client;
+    let client = shared.settings.client().map_err(|error| Failure::refused(&error.to_string()))?;
     let connection = client.get_multiplexed_async_connection_with_config(&config).await?;
     Ok(Session { connection, liveness })
 }

@@ -1,7 +1,7 @@
 //! What is kept for late joiners: the list that a field of a hash holds, and the own copy that it
 //! is written from.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Weak};
 
 use blaze_domain::WriterId;
@@ -134,12 +134,26 @@ impl Mirror {
         self.fields.forget_if(|_, newest| newest.publisher.strong_count() == 0);
     }
 
+    /// The hashes that the server is to have.
+    pub(super) fn hashes(&self) -> Vec<Arc<str>> {
+        let hashes: HashSet<&Arc<str>> = self.fields.iter().map(|((hash, _), ..)| hash).collect();
+        hashes.into_iter().cloned().collect()
+    }
+
+    /// The server has lost these hashes.
+    pub(super) fn rewrite(&mut self, is_lost: impl Fn(&Arc<str>) -> bool) {
+        let queued: HashSet<FieldKey> = self.rewrite.values().flatten().cloned().collect();
+        for (key, newest, _) in self.fields.iter().filter(|((hash, _), ..)| is_lost(hash)) {
+            if !queued.contains(key) {
+                self.rewrite.entry(newest.line).or_default().push_back(key.clone());
+            }
+        }
+    }
+
     /// The server has lost everything.
     pub(super) fn rewrite_all(&mut self) {
         self.rewrite.clear();
-        for (key, newest, _) in self.fields.iter() {
-            self.rewrite.entry(newest.line).or_default().push_back(key.clone());
-        }
+        self.rewrite(|_| true);
     }
 
     /// The next field that a connection has to write again.

@@ -141,6 +141,14 @@ pub struct RedisKeys {
 }
 
 impl RedisKeys {
+    /// Whether it can work, by what the section and its files say.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn check(section: &Section) -> Result<(), OpenError> {
+        Settings::read(section).map(drop)
+    }
+
     /// Reads what the section names. Connects nowhere.
     ///
     /// # Errors
@@ -263,6 +271,26 @@ impl RedisKeys {
     pub async fn record(&self, key: &str) -> Result<Option<Record>, KeyError> {
         let members: Record = self.ask(Cmd::hgetall(self.settings.names.key(key))).await?;
         Ok((!members.is_empty()).then_some(members))
+    }
+
+    /// Those of some keys that are not there.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn missing(&self, keys: &[String]) -> Result<Vec<String>, KeyError> {
+        let mut missing = Vec::new();
+        for part in keys.chunks(SCAN) {
+            let mut pipe = redis::pipe();
+            for key in part {
+                pipe.exists(self.settings.names.key(key));
+            }
+            let found: Vec<bool> = self
+                .call(|mut connection| async move { pipe.query_async(&mut connection).await })
+                .await?;
+            let gone = part.iter().zip(found).filter(|(_, is_there)| !is_there);
+            missing.extend(gone.map(|(key, _)| key.clone()));
+        }
+        Ok(missing)
     }
 
     /// All values whose key begins so, at most so many; keys are given without the prefix of the
@@ -388,7 +416,11 @@ impl RedisKeys {
         let config = AsyncConnectionConfig::new()
             .set_connection_timeout(Some(CONNECT))
             .set_response_timeout(Some(CALL));
-        let client = &self.settings.client;
+        // A file may be missing for the moment in which it is exchanged.
+        let client = self.settings.client().map_err(|error| KeyError::Away {
+            place: self.settings.place.clone(),
+            reason: error.to_string(),
+        })?;
         let made = client.get_multiplexed_async_connection_with_config(&config).await;
         let connection = made.map_err(|error| self.failed(&error))?;
         *self.connection.lock() = Some(connection.clone());

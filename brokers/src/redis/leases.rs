@@ -200,6 +200,22 @@ impl Leases {
     pub(super) fn wake(&self) {
         self.changed.notify_one();
     }
+
+    /// Name of their hash.
+    pub(super) fn hash(&self) -> Arc<str> {
+        Arc::clone(&self.ledger.lock().hash)
+    }
+
+    /// Whether the server is to have any.
+    pub(super) fn has_any(&self) -> bool {
+        !self.ledger.lock().kept.is_empty()
+    }
+
+    /// Writes all again: the server has lost them.
+    pub(super) fn rewrite_all(&self) {
+        self.ledger.lock().rewrite_all();
+        self.wake();
+    }
 }
 
 /// Writes changes, of each field the last, while the scope is ours, until the broker is closed.
@@ -230,7 +246,7 @@ async fn write_on(shared: &Shared, leases: &Leases) {
     }
 }
 
-fn is_owned(shared: &Shared) -> bool {
+pub(super) fn is_owned(shared: &Shared) -> bool {
     shared.state.read(|conditions| *conditions.scope() == ScopeOwnership::Owned)
 }
 

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! hold(lock, time, note)        ─► one script   who has it, and for how long; the note of who had it
+//! claim(lock, time)             ─► one script   who has it: of several the one with the largest name
 //! apply_if_held(lock, changes)  ─► one script   all of it, or nothing if somebody else has the lock
 //! ```
 
@@ -29,6 +30,7 @@ pub struct RedisLock {
 /// What runs on the server, which has it after the first call.
 pub(super) struct Scripts {
     hold: Script,
+    claim: Script,
     release: Script,
     apply: Script,
     pub(super) delete_record: Script,
@@ -38,6 +40,7 @@ impl Default for Scripts {
     fn default() -> Self {
         Self {
             hold: Script::new(HOLD),
+            claim: Script::new(CLAIM),
             release: Script::new(RELEASE),
             apply: Script::new(APPLY),
             delete_record: Script::new(DELETE_RECORD),
@@ -107,6 +110,21 @@ impl RedisKeys {
         Ok(Held { is_held, note })
     }
 
+    /// Takes a lock for so long from now, also from an owner whose name is smaller. Returns the name
+    /// of an owner that keeps it, because its name is larger.
+    ///
+    /// # Errors
+    /// [`KeyError`]: then it may be had.
+    pub async fn claim(
+        &self,
+        lock: &RedisLock,
+        time: Duration,
+    ) -> Result<Option<String>, KeyError> {
+        let mut call = self.scripts.claim.key(self.settings.names.key(&lock.key));
+        call.arg(&lock.owner).arg(u64::try_from(time.as_millis()).unwrap_or(u64::MAX).max(1));
+        self.call(|mut connection| async move { call.invoke_async(&mut connection).await }).await
+    }
+
     /// Gives a lock up, if its owner has it.
     ///
     /// # Errors
@@ -127,6 +145,14 @@ if owner and owner ~= ARGV[1] then return { 0, redis.call('GET', KEYS[2]) } end
 redis.call('SET', KEYS[1], ARGV[1], 'PX', ARGV[2])
 if owner and ARGV[4] ~= '' then redis.call('SET', KEYS[2], ARGV[4], 'PX', ARGV[3]) end
 return { 1, redis.call('GET', KEYS[2]) }
+";
+
+/// Taken unless an owner with a larger name has it, who is returned.
+const CLAIM: &str = r"
+local owner = redis.call('GET', KEYS[1])
+if owner and owner > ARGV[1] then return owner end
+redis.call('SET', KEYS[1], ARGV[1], 'PX', ARGV[2])
+return false
 ";
 
 /// Commands, each with the number of its words before it, if the lock is one's own.

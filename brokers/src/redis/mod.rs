@@ -21,6 +21,7 @@ mod keys;
 mod leases;
 mod liveness;
 mod lock;
+mod lost;
 mod owner;
 mod publisher;
 mod reader;
@@ -61,7 +62,7 @@ use leases::Leases;
 use owner::Owner;
 use publisher::Target;
 use server::{BufferLimits, ServerFacts};
-use settings::Settings;
+use settings::{Settings, check_scope};
 use state::{Line, LineState, ScopeOwnership, State};
 use subscriptions::Subscriptions;
 
@@ -97,7 +98,8 @@ struct Shared {
     mirror: Mutex<Mirror>,
     /// Which start of the server was met last, if any was; `None` inside where it does not tell.
     last_run: Mutex<Option<Option<String>>>,
-    warned_of_limits: AtomicBool,
+    /// It was said what is wrong with the set-up of the server.
+    warned: AtomicBool,
     stop: CancellationToken,
 }
 
@@ -119,7 +121,7 @@ impl Shared {
             connections: std::array::from_fn(|_| watch::Sender::new(None)),
             mirror: Mutex::default(),
             last_run: Mutex::default(),
-            warned_of_limits: AtomicBool::new(false),
+            warned: AtomicBool::new(false),
             stop: CancellationToken::new(),
             settings,
         }
@@ -184,14 +186,13 @@ impl Shared {
             );
             self.mirror.lock().rewrite_all();
         }
-        match limits {
-            None => tracing::debug!("redis does not tell its client-output-buffer-limit"),
-            Some(limits) => {
-                if let Some(complaint) = limits.complaint()
-                    && !self.warned_of_limits.swap(true, Ordering::Relaxed)
-                {
-                    tracing::warn!(complaint, "redis will cut off readers of large messages");
-                }
+        if limits.is_none() {
+            tracing::debug!("redis does not tell its client-output-buffer-limit");
+        }
+        let complaints = [facts.complaint(), limits.and_then(BufferLimits::complaint)];
+        if complaints != [None, None] && !self.warned.swap(true, Ordering::Relaxed) {
+            for complaint in complaints.into_iter().flatten() {
+                tracing::warn!(complaint, "redis is set up so that something gets lost");
             }
         }
         self.state.change(|conditions| {
@@ -216,6 +217,14 @@ impl Shared {
 }
 
 impl RedisBroker {
+    /// Whether it can be the broker of a node scope, by what the section and its files say.
+    ///
+    /// # Errors
+    /// As [`Self::open`], and for a URL with the number of a database.
+    pub fn check(section: &Section) -> Result<(), OpenError> {
+        check_scope(section)
+    }
+
     /// Connects in the background: the status tells how far it is. Call it inside a Tokio runtime.
     ///
     /// # Errors
@@ -242,6 +251,9 @@ impl RedisBroker {
         };
         broker.start(Line::PublishSmall);
         broker.start(Line::ReadSmall);
+        let leases = broker.flow.as_ref().map(|flow| Arc::clone(&flow.leases));
+        let watching = lost::watch(Arc::clone(&broker.shared), leases);
+        broker.supervisor.spawn("redis-lost", TaskPolicy::MayEnd, watching);
         broker.start_flow();
         Ok(broker)
     }

@@ -14,13 +14,15 @@ const LEAST_HARD_LIMIT: u64 = 4 * 32 * 1024 * 1024;
 /// The same for the limit that holds for some seconds: two of the largest messages.
 const LEAST_SOFT_LIMIT: u64 = 2 * 16 * 1024 * 1024;
 
-/// What `INFO server` tells.
+/// What `INFO` tells.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) struct ServerFacts {
     /// Program and version, such as `redis 7.0.15`.
     pub(super) version: String,
     /// Differs after each start of the server.
     pub(super) run_id: Option<String>,
+    /// What it does where memory is full.
+    pub(super) memory_policy: Option<String>,
 }
 
 impl ServerFacts {
@@ -33,7 +35,17 @@ impl ServerFacts {
                 None => program,
             },
             run_id: info.get("run_id"),
+            memory_policy: info.get("maxmemory_policy"),
         }
+    }
+
+    /// What is to be changed, if it may throw away what is kept on it.
+    pub(super) fn complaint(&self) -> Option<String> {
+        let policy = self.memory_policy.as_deref().filter(|policy| *policy != "noeviction")?;
+        Some(format!(
+            "maxmemory-policy is {policy}: where memory is full, leases, retained messages, \
+             configurations and signs of life vanish; set `maxmemory-policy noeviction`"
+        ))
     }
 }
 
@@ -69,10 +81,12 @@ impl BufferLimits {
 
 /// Asks the server who it is. Refused by its access list, the version stays unknown.
 pub(super) async fn facts(connection: &mut MultiplexedConnection) -> RedisResult<ServerFacts> {
-    match redis::cmd("INFO").arg("server").query_async(connection).await {
+    // With one section alone older servers take no second one.
+    match redis::cmd("INFO").query_async(connection).await {
         Ok(info) => Ok(ServerFacts::of(&info)),
         Err(error) if is_refusal(&error) => {
-            Ok(ServerFacts { version: "redis (version not told)".to_owned(), run_id: None })
+            let version = "redis (version not told)".to_owned();
+            Ok(ServerFacts { version, ..ServerFacts::default() })
         }
         Err(error) => Err(error),
     }
@@ -125,6 +139,9 @@ mod tests {
         let valkey = "# Server\r\nredis_version:7.2.4\r\nserver_name:valkey\r\nvalkey_version:9.1.2\r\nrun_id:d\r\n";
         assert_eq!(facts(valkey).version, "valkey 9.1.2");
         assert_eq!(facts("").version, "redis");
+        let policy = |name: &str| facts(&format!("maxmemory_policy:{name}\r\n")).complaint();
+        assert!(policy("allkeys-lru").unwrap().contains("allkeys-lru"));
+        assert_eq!(policy("noeviction").or(facts("").complaint()), None);
     }
 
     #[test]

@@ -17,7 +17,7 @@ const USER_TIMEOUT: Duration = Duration::from_secs(10);
 /// How the server is reached.
 #[derive(Debug, Clone)]
 pub(super) struct Settings {
-    pub(super) client: redis::Client,
+    section: Section,
     pub(super) names: Names,
     /// Host and port, or path: for people, without secrets.
     pub(super) place: String,
@@ -26,20 +26,43 @@ pub(super) struct Settings {
 impl Settings {
     /// Reads the files that the section names. Connects nowhere.
     pub(super) fn read(section: &Section) -> Result<Self, OpenError> {
-        let url = section.url.reveal();
-        let tls = section.tls.is_some() || url.starts_with("rediss://");
-        if tls && !cfg!(feature = "tls") {
-            return Err(OpenError::NotBuilt { feature: "tls" });
-        }
-        // The library's words for a bad URL name its part, never its text.
-        let info =
-            url.into_connection_info().map_err(|error| fault("redis.url", error.to_string()))?;
-        let info = with_login(info, section)?;
-        let info = info.set_tcp_settings(tcp_settings());
-        let place = info.addr().to_string();
-        let client = if tls { secure(info, section)? } else { plain(info)? };
-        Ok(Self { client, names: Names::new(&section.prefix), place })
+        let place = client(section)?.get_connection_info().addr().to_string();
+        Ok(Self { section: section.clone(), names: Names::new(&section.prefix), place })
     }
+
+    /// A client for one more connection, with what the files hold by now: a password or a
+    /// certificate may have been exchanged.
+    pub(super) fn client(&self) -> Result<redis::Client, OpenError> {
+        client(&self.section)
+    }
+}
+
+/// What is wrong with the section of a node scope; reads the files that it names. Channels are the
+/// same ones in all databases of a server, so that a number would not keep two nodes apart.
+pub(super) fn check_scope(section: &Section) -> Result<(), OpenError> {
+    match client(section)?.get_connection_info().redis_settings().db() {
+        0 => Ok(()),
+        number => Err(fault(
+            "redis.url",
+            format!(
+                "names database {number}, and channels are the same ones in all databases: leave \
+                 it out, and give each node a prefix of its own"
+            ),
+        )),
+    }
+}
+
+fn client(section: &Section) -> Result<redis::Client, OpenError> {
+    let url = section.url.reveal();
+    let tls = section.tls.is_some() || url.starts_with("rediss://");
+    if tls && !cfg!(feature = "tls") {
+        return Err(OpenError::NotBuilt { feature: "tls" });
+    }
+    // The library's words for a bad URL name its part, never its text.
+    let info = url.into_connection_info().map_err(|error| fault("redis.url", error.to_string()))?;
+    let info = with_login(info, section)?;
+    let info = info.set_tcp_settings(tcp_settings());
+    if tls { secure(info, section) } else { plain(info) }
 }
 
 fn fault(key: &str, reason: impl Into<String>) -> OpenError {

@@ -73,6 +73,10 @@ impl Failure {
     pub(super) fn away(why: &str) -> Self {
         Self { is_refusal: false, why: why.to_owned() }
     }
+
+    pub(super) fn refused(why: &str) -> Self {
+        Self { is_refusal: true, why: why.to_owned() }
+    }
 }
 
 /// What one connection is doing.

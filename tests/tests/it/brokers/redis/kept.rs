@@ -1,5 +1,7 @@
 //! What is kept for late joiners.
 
+use std::time::{Duration, Instant};
+
 use blaze_brokers::{Broker, Content, Health};
 use blaze_tests::servers::RedisKind;
 
@@ -71,6 +73,29 @@ async fn a_forgotten_writer_stays_forgotten() {
             "with its content"
         ),
         other => panic!("{other:?}"),
+    }
+}
+
+/// Under a memory policy whole keys vanish, and somebody may delete one.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn keys_that_vanish_are_written_again() {
+    let server = Server::start(RedisKind::Redis);
+    let flow = server.flow("edge/robot-1", 1);
+    wait_for(&flow, Health::Up).await;
+    let publisher = publisher(&flow, "map", 1);
+    publish(publisher.as_ref(), 1, 1);
+    settled(publisher.as_ref()).await;
+    flow.flow_side().unwrap().put_lease("a", "1".into());
+    let keys = ["blaze:flow:leases", "blaze:last:map"];
+    let are_there = || keys.iter().all(|key| server.cli(&["EXISTS", key]).trim() == "1");
+    eventually("all is written", || are_there().then_some(())).await;
+    server.cli(&["DEL", keys[0], keys[1]]);
+    assert!(!are_there());
+    // It is looked for each ten seconds, and has to be missing twice.
+    let until = Instant::now() + Duration::from_secs(30);
+    while !are_there() {
+        assert!(Instant::now() < until, "all is written again");
+        tokio::time::sleep(Duration::from_millis(200)).await;
     }
 }
 
