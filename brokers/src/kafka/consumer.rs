@@ -273,8 +273,13 @@ impl Consumer {
         }
         partition.next = offset + 1;
         let identity = partition.bare_writer.zip(u64::try_from(offset + 1).ok());
-        // A tombstone takes away; there is nothing to deliver.
-        let Some(payload) = message.payload() else { return };
+        let payload = match message.payload() {
+            Some(payload) => payload,
+            // It takes a key away; there is nothing to deliver.
+            None if topic.source.channel.is_reserved() || message.key().is_some() => return,
+            // A message may be empty, and some clients write that so.
+            None => &[],
+        };
         let wanted =
             |reader: &Reader| reader.starts.get(number).is_none_or(|start| offset >= *start);
         if topic.readers.iter().any(wanted) {

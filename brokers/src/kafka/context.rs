@@ -6,7 +6,7 @@ use parking_lot::Mutex;
 use rdkafka::ClientContext;
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::consumer::ConsumerContext;
-use rdkafka::error::KafkaError;
+use rdkafka::error::{KafkaError, RDKafkaErrorCode};
 
 use super::identity::Identities;
 
@@ -17,6 +17,19 @@ pub(super) struct LastError(Mutex<Option<String>>);
 impl LastError {
     pub(super) fn note(&self, text: String) {
         *self.0.lock() = Some(text);
+    }
+
+    /// What a client calls back. That all brokers are down says less than why the last one is, as
+    /// the name that it gave of itself and that is unknown here.
+    pub(super) fn note_event(&self, error: &KafkaError, reason: &str) {
+        let mut last = self.0.lock();
+        if last.is_none() || error.rdkafka_error_code() != Some(RDKafkaErrorCode::AllBrokersDown) {
+            *last = Some(format!("{error}: {reason}"));
+        }
+    }
+
+    pub(super) fn get(&self) -> Option<String> {
+        self.0.lock().clone()
     }
 
     pub(super) fn take(&self) -> Option<String> {
@@ -64,7 +77,7 @@ impl ClientContext for ReadContext {
     }
 
     fn error(&self, error: KafkaError, reason: &str) {
-        self.last_error.note(format!("{error}: {reason}"));
+        self.last_error.note_event(&error, reason);
     }
 }
 

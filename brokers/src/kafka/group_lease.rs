@@ -181,7 +181,7 @@ impl ClientContext for Context {
     }
 
     fn error(&self, error: KafkaError, reason: &str) {
-        self.last_error.note(format!("{error}: {reason}"));
+        self.last_error.note_event(&error, reason);
     }
 }
 

@@ -177,7 +177,7 @@ fn round(inner: &Inner, turn: usize, silent: &mut Silent) -> bool {
 
 fn lost(inner: &Inner, reason: &str) -> bool {
     inner.shared.gate.set_up(false);
-    let reason = inner.shared.last_error.take().unwrap_or_else(|| reason.to_owned());
+    let reason = inner.shared.last_error.get().unwrap_or_else(|| reason.to_owned());
     inner.set_server(false, format!("{}: {reason}", inner.shared.settings.place()));
     false
 }

@@ -40,6 +40,7 @@ impl Names {
     pub(super) fn new(prefix: &str) -> Result<Self, String> {
         let prefix = prefix.replace('/', ".");
         match prefix.chars().find(|c| !is_legal(*c)) {
+            None if is_kept(&prefix) => Err("begins with __, which Kafka keeps for itself".into()),
             None => Ok(Self { prefix }),
             Some(found) => {
                 Err(format!("holds {found:?}, and Kafka's topics have only A-Z a-z 0-9 . _ -"))
@@ -58,6 +59,9 @@ impl Names {
                 topic.len()
             ));
         }
+        if is_kept(&topic) {
+            return refuse(format!("Kafka keeps names that begin with __, as {topic}, for itself"));
+        }
         if topic == "." || topic == ".." || !topic.chars().all(is_legal) {
             return refuse(format!("{topic:?} cannot be a Kafka topic"));
         }
@@ -73,6 +77,11 @@ impl Names {
     pub(super) fn reserved(&self, channel: &str) -> Arc<str> {
         Arc::from(format!("{}{}", self.prefix, channel.replace('/', ".")))
     }
+}
+
+/// Whether Kafka keeps such topics for itself, as `__transaction_state`.
+fn is_kept(topic: &str) -> bool {
+    topic.starts_with("__")
 }
 
 fn is_legal(c: char) -> bool {
@@ -105,6 +114,9 @@ mod tests {
     #[test]
     fn impossible_names_are_refused() {
         assert!(Names::new("a:").is_err());
+        assert!(Names::new("__a").is_err());
+        assert!(matches!(topic("", "__transaction_state"), Err(BrokerError::Name { .. })));
+        assert!(matches!(topic("_", "_a"), Err(BrokerError::Name { .. })));
         let longest = "t".repeat(200);
         assert!(topic(&"p".repeat(49), &longest).is_ok());
         assert!(matches!(topic(&"p".repeat(50), &longest), Err(BrokerError::Name { .. })));

@@ -2,19 +2,22 @@
 //! librdkafka.
 //!
 //! ```text
-//! publish ─► outbox (bounds, deadlines) ─► feeder task ─► librdkafka (≤ 1 MiB not acknowledged) ─► server
+//! publish ─► outbox (bounds, deadlines) ─► feeder task ─► librdkafka (≤ 1 MiB, and ≤ 2 flights of a topic) ─► server
 //!                                             ▲                    │
 //!                                             └── room ── delivery callback (poll thread): settles, measures the clock
 //! ```
 //!
 //! Little is with librdkafka because from there nothing can be taken back: it has no deadline of a
-//! message's own.
+//! message's own. And what comes while two flights of its topic are under way goes as one, so that
+//! messages that come one by one and often do not each make a request.
 
 mod delivery;
 mod ready;
 #[cfg(test)]
 mod tests;
 
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -29,7 +32,7 @@ use tokio::sync::{Notify, oneshot};
 
 use super::inner::Shared;
 use super::settings::Lot;
-use super::topics::Topic;
+use super::topics::{Flight, Topic};
 use super::waker::ThreadWaker;
 use crate::outbox::{Fate, Lane, Outbox, OutboxLimits, Waiting};
 use delivery::{Delivery, Sent, SharedContext, WriteContext};
@@ -227,6 +230,8 @@ impl Producer {
             // Topics with small batches have one turn in each take: what of them is handed over
             // goes together.
             let mut limited: Vec<Arc<str>> = Vec::new();
+            let mut flights: HashMap<*const Topic, Arc<Flight>> = HashMap::new();
+            let now = Instant::now();
             let allowance = |to: &Target| {
                 let topic = &to.topic;
                 let open =
@@ -238,16 +243,23 @@ impl Producer {
                     }
                     limited.push(Arc::clone(&topic.name));
                 }
+                if let Entry::Vacant(none) = flights.entry(Arc::as_ptr(topic)) {
+                    none.insert(topic.depart(now)?);
+                }
                 Some(allowed)
             };
             let room = WINDOW - in_flight;
-            self.outbox.take_ready(Instant::now(), BATCH, room, in_flight == 0, allowance, taken);
+            self.outbox.take_ready(now, BATCH, room, in_flight == 0, allowance, taken);
             if taken.is_empty() {
                 return;
             }
             // All at once, as librdkafka begins to send what it has with the first.
-            let ready: Vec<Ready> =
-                taken.drain(..).map(|waiting| Ready::new(waiting, scratch)).collect();
+            let ready = taken.drain(..).map(|waiting| {
+                let flight = flights.get(&Arc::as_ptr(&waiting.to.topic)).cloned();
+                Ready::new(waiting, flight, scratch)
+            });
+            let ready: Vec<Ready> = ready.collect();
+            drop(flights);
             for ready in ready {
                 let topic = Arc::clone(&ready.delivery.topic);
                 let mut record = BaseRecord::with_opaque_to(&topic.name, ready.delivery)
@@ -284,6 +296,7 @@ impl Producer {
             topic: Arc::clone(topic),
             bytes: key.len() + value.map_or(0, Bytes::len) + 1,
             sent: Instant::now(),
+            flight: None,
         });
         let mut record = BaseRecord::with_opaque_to(&topic.name, delivery).key(key);
         record.partition = partition;

@@ -3,12 +3,20 @@
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
 
 /// Bytes of a batch that no batch of ours reaches: twice `batch.size`, for what a record has beside
 /// its payload.
 const ROOMY: usize = 1_000_000;
+/// Flights of a topic at a time. With one, what comes waits for its answer; with more, each carries
+/// less, and the client library, which looks without a pause while five requests are not answered,
+/// takes a processor.
+const MAX_FLIGHTS: usize = 2;
+/// A flight that takes longer holds up nothing any more: one partition of several may have no
+/// leader.
+pub(super) const LONG_FLIGHT: Duration = Duration::from_millis(100);
 /// Not known to exist.
 const ABSENT: i32 = 0;
 
@@ -24,11 +32,45 @@ pub(super) struct Topic {
     asks_limit: AtomicBool,
     /// Messages that are with the client library and not acknowledged.
     in_flight: AtomicUsize,
+    flights: Mutex<Flights>,
     /// Written also while the scope belongs to another flow.
     pub(super) stays_open: bool,
 }
 
+/// What was handed over and not acknowledged as a whole.
+#[derive(Debug, Default)]
+struct Flights {
+    count: usize,
+    last: Option<Instant>,
+}
+
+/// Messages of one topic that were handed over together. It ends with the last of them.
+#[derive(Debug)]
+pub(super) struct Flight(Arc<Topic>);
+
+impl Drop for Flight {
+    fn drop(&mut self) {
+        let mut flights = self.0.flights.lock();
+        flights.count = flights.count.saturating_sub(1);
+    }
+}
+
 impl Topic {
+    /// What is handed over next goes together; `None`: what comes waits for what is under way, so
+    /// that few large requests carry many messages where many come, and none waits where few do.
+    pub(super) fn depart(self: &Arc<Self>, now: Instant) -> Option<Arc<Flight>> {
+        let mut flights = self.flights.lock();
+        let is_long =
+            flights.last.is_some_and(|last| now.saturating_duration_since(last) >= LONG_FLIGHT);
+        if flights.count >= MAX_FLIGHTS && !is_long {
+            return None;
+        }
+        flights.count += 1;
+        flights.last = Some(now);
+        drop(flights);
+        Some(Arc::new(Flight(Arc::clone(self))))
+    }
+
     /// How many partitions the server has of it; `None` = it is not known to be there, so that
     /// nothing is handed over.
     pub(super) fn partitions(&self) -> Option<i32> {
@@ -110,6 +152,7 @@ impl Topics {
             largest_batch: AtomicUsize::new(0),
             asks_limit: AtomicBool::new(true),
             in_flight: AtomicUsize::new(0),
+            flights: Mutex::default(),
             stays_open,
         });
         by_name.insert(Arc::clone(name), Arc::downgrade(&topic));
@@ -232,6 +275,26 @@ mod tests {
             topics.without_limit(&found(&[("a", 1)]), 8).is_empty(),
             "not asked again and again"
         );
+    }
+
+    #[test]
+    fn two_flights_are_under_way_and_a_long_one_holds_up_nothing() {
+        let topics = Topics::default();
+        let (topic, _) = topics.of(&Arc::from("a"), false);
+        let now = Instant::now();
+        let first = topic.depart(now).unwrap();
+        let second = topic.depart(now).unwrap();
+        let of_second = Arc::clone(&second);
+        assert!(topic.depart(now).is_none());
+        drop(second);
+        assert!(topic.depart(now).is_none(), "one message of it is not acknowledged");
+        drop(of_second);
+        let third = topic.depart(now).unwrap();
+        assert!(topic.depart(now + LONG_FLIGHT / 2).is_none());
+        let fourth = topic.depart(now + LONG_FLIGHT).unwrap();
+        assert!(topic.depart(now + LONG_FLIGHT).is_none());
+        drop((first, third, fourth));
+        assert!(topic.depart(now + LONG_FLIGHT).is_some());
     }
 
     #[test]

@@ -16,7 +16,7 @@ use tokio::sync::{Notify, oneshot};
 use super::CROWD;
 use crate::kafka::context;
 use crate::kafka::inner::Shared;
-use crate::kafka::topics::Topic;
+use crate::kafka::topics::{Flight, Topic};
 use crate::kafka::waker::ThreadWaker;
 use crate::outbox::{Fate, Receipt};
 
@@ -30,6 +30,8 @@ pub(in crate::kafka) struct Delivery {
     pub(in crate::kafka) bytes: usize,
     pub(in crate::kafka) sent: Instant,
     pub(in crate::kafka) receipt: Sent,
+    /// What it was handed over with; `None` for a value of a key.
+    pub(in crate::kafka) flight: Option<Arc<Flight>>,
 }
 
 /// The party that learns what became of a record.
@@ -66,7 +68,7 @@ impl ClientContext for SharedContext {
         if error.rdkafka_error_code() == Some(RDKafkaErrorCode::Fatal) {
             self.0.fatal.store(true, Ordering::Release);
         }
-        self.0.shared.last_error.note(format!("{error}: {reason}"));
+        self.0.shared.last_error.note_event(&error, reason);
     }
 }
 
@@ -101,7 +103,7 @@ impl WriteContext {
 
     /// A record is no longer with the client: it was delivered, or there is an error.
     pub(in crate::kafka) fn settle(&self, delivery: Delivery, error: Option<&KafkaError>) {
-        let Delivery { topic, bytes, receipt, .. } = delivery;
+        let Delivery { topic, bytes, receipt, flight, .. } = delivery;
         let is_message = matches!(receipt, Sent::Message(_));
         let fate = error.map_or(Fate::Delivered, |error| self.failed(error, &topic, is_message));
         match receipt {
@@ -112,7 +114,8 @@ impl WriteContext {
         topic.note_in_flight(false);
         let before = self.in_flight.fetch_sub(bytes, Ordering::AcqRel);
         let after = before.saturating_sub(bytes);
-        if after == 0 || (before >= CROWD && after < CROWD) || topic.is_limited() {
+        let has_landed = flight.and_then(Arc::into_inner).is_some();
+        if has_landed || after == 0 || (before >= CROWD && after < CROWD) || topic.is_limited() {
             self.room.notify_one();
         }
     }

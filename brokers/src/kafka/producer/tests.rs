@@ -2,9 +2,45 @@
 
 use super::*;
 use crate::kafka::settings::tests::shared_at;
-use crate::kafka::topics::Topics;
+use crate::kafka::topics::{LONG_FLIGHT, Topics};
 use crate::outbox::Body;
 use crate::port::PublishOutcome;
+
+/// Where many messages come one by one, those that come meanwhile wait and go together.
+#[test]
+fn what_comes_while_two_flights_are_under_way_waits() {
+    // On a busy machine the flights may become long ones before the third message comes.
+    let mut tries = 0..20;
+    assert!(tries.any(|_| {
+        let begin = Instant::now();
+        let waits = third_of_a_topic_waits();
+        assert!(waits || begin.elapsed() >= LONG_FLIGHT, "the third goes");
+        waits
+    }));
+}
+
+fn third_of_a_topic_waits() -> bool {
+    let producer = Producer::new(Lot::default(), &shared_at("127.0.0.1:9")).unwrap();
+    producer.shared().gate.set_up(true);
+    let topics = Topics::default();
+    let lane_of = |name: &str| {
+        let (topic, _) = topics.of(&name.into(), false);
+        topics.note(&std::collections::HashMap::from([(name.to_owned(), 1)]), false);
+        producer.lane(Target { topic, keying: Keying::Writer { depth: 0 } })
+    };
+    let (one, other) = (lane_of("a"), lane_of("b"));
+    let publish = |lane: &Lane<Target>| {
+        assert_eq!(lane.push(Body::Bare(Bytes::from_static(b"x")), None), PublishOutcome::Taken);
+        producer.hand_over(&mut Vec::new(), &mut String::new());
+        producer.context.in_flight.load(Ordering::Acquire)
+    };
+    let first = publish(&one);
+    let second = publish(&one);
+    assert!(0 < first && first < second);
+    let third = publish(&one);
+    assert!(publish(&other) > third, "that of another topic goes");
+    third == second
+}
 
 /// Closing ends a client that is drained, with what is on its way from the outbox to it.
 #[test]

@@ -34,12 +34,12 @@ async fn bare_records_have_the_identity_of_their_place() {
     let mut of_flow = reader(&flow.broker, &channel).await;
     let mut of_service = reader(&service, &channel).await;
     for partition in 0..3 {
-        plain.write(&name, partition, &["one", "two"]);
+        plain.write(&name, partition, &["one", "two", ""]);
     }
     let uuid = topic_uuid(&server, &name);
     for (reader, layer) in [(&mut of_flow, "fog"), (&mut of_service, "")] {
         let mut found: BTreeMap<WriterId, Vec<(u64, String)>> = BTreeMap::new();
-        for _ in 0..6 {
+        for _ in 0..9 {
             let (payload, identity) = reader.next_bare().await;
             let (writer, sequence) = identity.unwrap();
             let text = String::from_utf8(payload.to_vec()).unwrap();
@@ -47,7 +47,8 @@ async fn bare_records_have_the_identity_of_their_place() {
         }
         for partition in 0..3 {
             let first = if partition == 1 { 2 } else { 1 };
-            let expected = vec![(first, "one".to_owned()), (first + 1, "two".to_owned())];
+            let expected = [(first, "one"), (first + 1, "two"), (first + 2, "")];
+            let expected = expected.map(|(sequence, text)| (sequence, text.to_owned())).to_vec();
             assert_eq!(
                 found.get(&bare_writer(layer, &uuid, partition)),
                 Some(&expected),

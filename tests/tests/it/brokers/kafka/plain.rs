@@ -72,7 +72,9 @@ impl PlainProducer {
 
     pub(crate) fn write(&self, topic: &str, partition: i32, values: &[&str]) {
         for value in values {
-            let record = BaseRecord::<str, str>::to(topic).partition(partition).payload(value);
+            let record = BaseRecord::<str, str>::to(topic).partition(partition);
+            // Without a value, as some clients write an empty one.
+            let record = if value.is_empty() { record } else { record.payload(value) };
             self.0.send(record).map_err(|(error, _)| error).unwrap();
         }
         self.0.flush(TIMEOUT).unwrap();
