@@ -10,8 +10,8 @@ use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, Role, node_schema, open_layer, open_node};
 use blaze_domain::InstanceName;
-use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
-use blaze_runtime::admin::Readiness;
+use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
+use blaze_runtime::admin::{Readiness, say_listening};
 use blaze_runtime::config::{
     Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_or_say,
     parse_override, watch_with,
@@ -22,6 +22,7 @@ use blaze_runtime::supervisor::{
 };
 use blaze_runtime::{environment, forbid_core_dumps, logs, ready_line, say, state};
 use blaze_worker::admin::Shown;
+use blaze_worker::copy::Vault;
 use blaze_worker::lease;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::{LocalBroker, WorkerSettings};
@@ -76,7 +77,17 @@ fn main() -> ExitCode {
 
 /// The node file as this program reads it.
 fn schema() -> Schema<NodeFile> {
-    node_schema(|file| WorkerSettings::of(file).err().unwrap_or_default())
+    node_schema(|file| {
+        let mut faults = WorkerSettings::of(file).err().unwrap_or_default();
+        let key = Vault::load(file.worker.key_file.as_deref());
+        faults.extend(
+            key.err().map(|error| Fault {
+                path: "worker.key_file".to_owned(),
+                detail: error.to_string().trim_start_matches("worker.key_file: ").to_owned(),
+            }),
+        );
+        faults
+    })
 }
 
 async fn run(sources: Sources, loaded: Loaded<NodeFile>, instance: InstanceName) -> ExitCode {
@@ -108,6 +119,7 @@ async fn start(
     let (readiness, shown) = (Readiness::new(), Shown::default());
     let address =
         shown.serve(file.admin.worker, settings.scope(), readiness.clone(), supervisor).await?;
+    say_listening(address);
     let worker = Arc::new(begin(settings, file, instance, supervisor).await?);
     shown.set(Arc::clone(&worker));
     let overlays = worker.own().overlays();

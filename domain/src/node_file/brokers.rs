@@ -264,7 +264,10 @@ impl Ros2Plugin {
 }
 
 fn address(node: &Node<'_>) -> Option<Ipv4Addr> {
-    formed("an IPv4 address", |text| text.parse().ok())(node)
+    let is_of_host = |address: &Ipv4Addr| {
+        !(address.is_unspecified() || address.is_multicast() || address.is_broadcast())
+    };
+    formed("the IPv4 address of one host", |text| text.parse().ok().filter(is_of_host))(node)
 }
 
 /// What stands before names: it must leave every name valid on every broker.

@@ -198,7 +198,7 @@ fn all_faults_come_at_once() {
             "brokers.node: holds redis and memory; only one of redis, memory is allowed",
             "brokers.layer: needs one of dds, kafka, memory",
             "brokers.inter.dds.domain: 101 is not a whole number from 0 to 100",
-            "brokers.inter.dds.listen: \"here\" is not an IPv4 address",
+            "brokers.inter.dds.listen: \"here\" is not the IPv4 address of one host",
             "brokers.inter.dds.peers[1]: expected text, found the number 7; put it in quotes",
             "brokers.inter.dds.mtu: 1279 is not a whole number from 1280 to 65535",
             "flow.bandwidth.limit_mbps: expected a number from 0.001 to 1000000, found text",
