@@ -86,7 +86,10 @@ pub struct TopicRow {
     /// Whether the consumer still listens.
     #[serde(skip)]
     pub active: bool,
-    /// Seconds from the last message to the end; absent without any.
+    /// Whether a message was published that the consumer should have, as far as is known here.
+    #[serde(skip)]
+    pub due: bool,
+    /// From the last message received to the last one published; absent without any.
     #[serde(skip)]
     pub silent: Option<Duration>,
 }
@@ -137,11 +140,13 @@ struct PublisherEntry {
     sent: u64,
     sent_before: u64,
     first: Option<Instant>,
+    last: Option<Instant>,
 }
 
 #[derive(Debug)]
 struct ConsumerEntry {
     consumer: Consumer,
+    began: Instant,
     publisher: usize,
     stats: ConsumerStats,
     active: bool,
@@ -184,6 +189,15 @@ impl DropCounter {
     }
 }
 
+impl PublisherEntry {
+    /// Whether whoever listens since then should have had a message. What is not published here may
+    /// be.
+    fn is_due(&self, since: Instant) -> bool {
+        let keeps = self.topic.depth > 0;
+        !self.here || self.last.is_some_and(|last| keeps || last >= since)
+    }
+}
+
 impl ConsumerEntry {
     fn dropped(&self) -> BTreeMap<String, u64> {
         let mut total = self.on_the_way.total();
@@ -210,6 +224,7 @@ impl Board {
             sent: 0,
             sent_before: 0,
             first: None,
+            last: None,
         });
         Self {
             start,
@@ -227,6 +242,7 @@ impl Board {
         if let Some(publisher) = self.state.lock().publishers.get_mut(topic) {
             publisher.sent += 1;
             publisher.first.get_or_insert(now);
+            publisher.last = Some(now);
         }
     }
 
@@ -237,6 +253,7 @@ impl Board {
             state.publishers.iter().position(|entry| entry.topic.name == consumer.topic)?;
         state.consumers.push(ConsumerEntry {
             consumer,
+            began: now,
             publisher,
             stats: ConsumerStats::new(now),
             active: true,
@@ -293,6 +310,16 @@ impl Board {
         state.consumers.get(id.0).map_or(0, |entry| entry.stats.received())
     }
 
+    /// Whether a message was published that a consumer should have, as far as is known here.
+    #[must_use]
+    pub fn is_due(&self, id: ConsumerId) -> bool {
+        let state = self.state.lock();
+        let entry = state.consumers.get(id.0);
+        let publisher =
+            entry.and_then(|entry| Some((entry, state.publishers.get(entry.publisher)?)));
+        publisher.is_some_and(|(entry, publisher)| publisher.is_due(entry.began))
+    }
+
     /// Messages that all consumers have received.
     #[must_use]
     pub fn received_by_all(&self) -> u64 {
@@ -345,12 +372,12 @@ impl Board {
             let before = std::mem::replace(&mut entry.dropped_before, total.clone());
             if let Some(publisher) = publishers.get(entry.publisher).filter(|_| entry.active) {
                 let sent = publisher.sent - publisher.sent_before;
-                let mut row = row(publisher, sent, seconds, Some(entry), &period, faults, now);
+                let mut row = row(publisher, sent, seconds, Some(entry), &period, faults);
                 row.dropped = difference(&total, &before);
                 rows.push(row);
             }
         }
-        rows.extend(unheard(publishers, consumers, now, |publisher| {
+        rows.extend(unheard(publishers, consumers, |publisher| {
             (publisher.sent - publisher.sent_before, seconds)
         }));
         for publisher in publishers {
@@ -377,9 +404,9 @@ impl Board {
             let until = if entry.active { last.max(end) } else { last };
             let (count, seconds) = sent(publisher);
             let (period, faults) = (entry.stats.total(until), Faults::of(&entry.at_consumer));
-            Some(row(publisher, count, seconds, Some(entry), &period, faults, end))
+            Some(row(publisher, count, seconds, Some(entry), &period, faults))
         });
-        heard.chain(unheard(publishers, consumers, end, sent)).collect()
+        heard.chain(unheard(publishers, consumers, sent)).collect()
     }
 
     /// Seconds from the start to the first message in each layer that has one.
@@ -425,7 +452,6 @@ impl Board {
 fn unheard<'a>(
     publishers: &'a [PublisherEntry],
     consumers: &'a [ConsumerEntry],
-    now: Instant,
     sent: impl Fn(&PublisherEntry) -> (u64, f64) + 'a,
 ) -> impl Iterator<Item = TopicRow> + 'a {
     let nobody = move |publisher: &&PublisherEntry| {
@@ -434,7 +460,7 @@ fn unheard<'a>(
     };
     publishers.iter().filter(nobody).map(move |publisher| {
         let (count, seconds) = sent(publisher);
-        row(publisher, count, seconds, None, &Period::default(), Faults::default(), now)
+        row(publisher, count, seconds, None, &Period::default(), Faults::default())
     })
 }
 
@@ -445,7 +471,6 @@ fn row(
     entry: Option<&ConsumerEntry>,
     period: &Period,
     faults: Faults,
-    end: Instant,
 ) -> TopicRow {
     let rate = |count: u64, seconds: f64| if seconds > 0.0 { count as f64 / seconds } else { 0.0 };
     TopicRow {
@@ -469,7 +494,9 @@ fn row(
         },
         large: publisher.topic.large,
         active: entry.is_some_and(|entry| entry.active),
-        silent: entry.and_then(|entry| Some(end.saturating_duration_since(entry.stats.last?.0))),
+        due: entry.is_some_and(|entry| publisher.is_due(entry.began)),
+        silent: entry
+            .and_then(|entry| Some(publisher.last?.saturating_duration_since(entry.stats.last?.0))),
     }
 }
 

@@ -13,6 +13,7 @@ fn topic(name: &str, large: bool) -> PlayedTopic {
         encoding: String::new(),
         rate_hz: 50.0,
         max_bytes: 100,
+        depth: 0,
         large,
     }
 }

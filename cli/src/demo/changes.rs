@@ -21,6 +21,8 @@ use super::board::Board;
 use super::roles::{MOVES_FROM, MOVING_SERVICE, PUBLISHING_NODE};
 use super::stage::Stage;
 
+/// Where no topic has so many messages a second, no change shows.
+pub const SLOWEST_HZ: f64 = 2.0;
 /// A shorter run has no time for changes beside the move.
 pub const SHORTEST: Duration = Duration::from_secs(10);
 /// Parts of the run after which they come.

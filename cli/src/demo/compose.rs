@@ -19,11 +19,11 @@ use blaze_runtime::Supervisor;
 use tokio::sync::Mutex;
 
 use super::board::Board;
-use super::changes::{ChangePlan, SHORTEST};
+use super::changes::{ChangePlan, SHORTEST, SLOWEST_HZ};
 use super::configuration::{Configuration, Place};
 use super::nodes::{Nodes, start_nodes, wait_ready};
 use super::options::DemoOptions;
-use super::recording::{self, Recording};
+use super::recording::{self, MAX_GAP, Recording};
 use super::report::{Report, Style};
 use super::roles::{PUBLISHING_NODE, PlayedTopic, consumers, played_topics};
 use super::session;
@@ -138,9 +138,16 @@ fn plan(
             "no change of the configuration is shown: that needs --duration {shortest}s or more"
         ));
     }
+    let fastest = topics.iter().map(|topic| topic.rate_hz).fold(0.0, f64::max);
+    if fastest < SLOWEST_HZ {
+        return Err(format!(
+            "no change of the configuration is shown: that needs a topic with {SLOWEST_HZ} \
+             messages a second or more"
+        ));
+    }
     Ok(ChangePlan {
         limit_mbps: robot.limit_mbps,
-        with_pictures: topics.iter().any(|topic| topic.large),
+        with_pictures: topics.iter().any(|topic| topic.large && topic.rate_hz >= SLOWEST_HZ),
         limit_binds: options.record.is_empty() && options.set.is_empty(),
     })
 }
@@ -166,6 +173,18 @@ fn tell_skipped(recordings: &[Recording]) {
         let file = recording.path.display();
         for skipped in &recording.skipped {
             eprintln!("blaze: {file}: {} is not played: {}", skipped.topic, skipped.reason);
+        }
+        if let Some(cut) = &recording.cut {
+            eprintln!("blaze: {file}: the rest is missing, and what was read is played: {cut}");
+        }
+        let (shortened, longest) = recording.shortened;
+        if shortened > 0 {
+            eprintln!(
+                "blaze: {file}: {shortened} times without a message are shortened to {} s; the \
+                 longest has {} s",
+                MAX_GAP.as_secs(),
+                longest.as_secs()
+            );
         }
         if recording.unusable_messages > 0 {
             eprintln!("blaze: {file}: {} messages cannot be played", recording.unusable_messages);

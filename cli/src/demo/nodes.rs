@@ -78,8 +78,7 @@ pub(super) async fn start_nodes(
     let mut running = Vec::new();
     for (node, (settings, file)) in settings {
         let limit_mbps = settings.live.bandwidth.limit_mbps;
-        let epochs = Epochs::begin(&settings.me, None)
-            .map_err(|error| CliError::Failed(format!("{} has no epoch: {error}", node.name())))?;
+        let epochs = Epochs::begin(&settings.me, None);
         let brokers = source.of(node, &settings.me, epochs.first())?;
         let beginning = Beginning { epochs, layer_prefix: brokers.layer_prefix.clone() };
         let flow_options = FlowOptions {

@@ -17,6 +17,8 @@ fn recording(offsets_ms: &[u64], period_ms: u64) -> Arc<Recording> {
         period: Duration::from_millis(period_ms),
         skipped: Vec::new(),
         unusable_messages: 0,
+        cut: None,
+        shortened: (0, Duration::ZERO),
     })
 }
 

@@ -11,7 +11,7 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use blaze_domain::{MAX_PAYLOAD_BYTES, NameError, TopicName};
+use blaze_domain::{Durability, MAX_PAYLOAD_BYTES, NameError, TopicName};
 use bytes::Bytes;
 use mcap::McapError;
 use mcap::io::MessageReader;
@@ -27,6 +27,9 @@ pub const MAX_MESSAGES: usize = 10_000_000;
 pub const MAX_TOPICS: usize = 1_000;
 /// Largest record of an MCAP file, chunks included, compressed or not.
 const MAX_RECORD_BYTES: usize = 256 * 1024 * 1024;
+/// Longest time without a message while playing: one that is longer in the recording is shortened
+/// to it.
+pub const MAX_GAP: Duration = Duration::from_secs(10);
 /// Loop period of a recording whose messages all have one time.
 const SINGLE_PERIOD: Duration = Duration::from_secs(1);
 
@@ -63,17 +66,13 @@ pub enum RecordingError {
         /// What it seems to be, and what to do.
         found: &'static str,
     },
-    /// It is an MCAP file with a fault.
-    #[error("{}: after byte {offset} and {messages} messages: {error}", path.display())]
+    /// It is an MCAP file with a fault before its first message.
+    #[error("{}: {fault}", path.display())]
     Broken {
         /// The file.
         path: PathBuf,
-        /// Bytes that were read before the fault was seen.
-        offset: u64,
-        /// Messages that were read before it.
-        messages: usize,
-        /// What is wrong.
-        error: McapError,
+        /// What is wrong, and where.
+        fault: Fault,
     },
     /// Nothing in it can be played.
     #[error("{}: nothing to play{}", path.display(), skipped_text(skipped))]
@@ -83,6 +82,18 @@ pub enum RecordingError {
         /// What is in it, and why it is not played.
         skipped: Vec<Skipped>,
     },
+}
+
+/// Where reading ended before the end of a recording. What was read before is played.
+#[derive(Debug, thiserror::Error)]
+#[error("after byte {offset} and {messages} messages: {error}")]
+pub struct Fault {
+    /// Bytes that were read before the fault was seen.
+    pub offset: u64,
+    /// Messages that were read before it.
+    pub messages: usize,
+    /// What is wrong.
+    pub error: McapError,
 }
 
 fn skipped_text(skipped: &[Skipped]) -> String {
@@ -136,6 +147,8 @@ pub struct RecordedTopic {
     pub max_bytes: usize,
     /// Mean rate over one loop.
     pub rate_hz: f64,
+    /// Whether its publisher kept messages for those who came later, as the file says.
+    pub durability: Durability,
     /// Mean time between messages.
     mean_gap: Duration,
 }
@@ -175,6 +188,10 @@ pub struct Recording {
     pub skipped: Vec<Skipped>,
     /// Messages that are larger than a message may be, or pictures that do not decode.
     pub unusable_messages: u64,
+    /// Why the rest of the file is missing, for people.
+    pub cut: Option<String>,
+    /// Times without a message that were shortened, and the longest.
+    pub shortened: (u64, Duration),
 }
 
 /// The recordings that the program carries with it.
@@ -224,6 +241,7 @@ pub(super) struct RawRecording {
     pub(super) messages: Vec<(usize, u64, Body)>,
     skipped: Vec<Skipped>,
     unusable: u64,
+    cut: Option<String>,
 }
 
 #[derive(Debug)]
@@ -231,6 +249,7 @@ pub(super) struct RawTopic {
     pub(super) name: TopicName,
     pub(super) type_name: String,
     pub(super) encoding: String,
+    durability: Durability,
     /// Payload size where it is not yet known from the messages.
     pub(super) decoded_bytes: Option<usize>,
 }
@@ -298,12 +317,29 @@ fn read_records(
         raw.messages.push((topic, message.log_time, body));
     };
     drop(reader);
-    Err(RecordingError::Broken {
-        path: path.to_owned(),
+    let fault = Fault {
         offset: source.count + mcap::MAGIC.len() as u64,
         messages: raw.messages.len(),
         error: fault,
-    })
+    };
+    if raw.messages.is_empty() {
+        return Err(RecordingError::Broken { path: path.to_owned(), fault });
+    }
+    // A recorder that loses power leaves no end.
+    raw.cut = Some(fault.to_string());
+    Ok(raw)
+}
+
+/// What a recorder of ROS 2 noted of the publishers of a channel: whether one of them kept messages
+/// for those who came later. It writes the number or, since ROS 2 Iron, the word.
+fn durability(channel: &mcap::Channel<'_>) -> Durability {
+    let profiles = channel.metadata.get("offered_qos_profiles").map_or("", String::as_str);
+    let is_kept = profiles.lines().any(|line| {
+        let line = line.trim_start_matches([' ', '-']);
+        let value = line.strip_prefix("durability:").map(str::trim);
+        matches!(value, Some("1" | "transient_local"))
+    });
+    if is_kept { Durability::TransientLocal } else { Durability::Volatile }
 }
 
 /// Reads the first bytes and says what the file is, if it is not MCAP.
@@ -354,6 +390,7 @@ impl RawRecording {
                         name,
                         type_name: type_name.to_owned(),
                         encoding,
+                        durability: durability(channel),
                         decoded_bytes: None,
                     });
                     Ok(self.topics.len() - 1)
@@ -388,11 +425,18 @@ impl RawRecording {
         self.messages.sort_by_key(|(_, time, _)| *time);
         let first = self.messages.first().map_or(0, |(_, time, _)| *time);
         let mut paces: BTreeMap<usize, Pace> = BTreeMap::new();
+        let (mut before, mut played) = (first, Duration::ZERO);
+        let mut shortened = (0, Duration::ZERO);
         let messages: Vec<RecordedMessage> = self
             .messages
             .into_iter()
             .map(|(topic, time, body)| {
-                let offset = Duration::from_nanos(time - first);
+                let gap = Duration::from_nanos(time - std::mem::replace(&mut before, time));
+                if gap > MAX_GAP {
+                    shortened = (shortened.0 + 1, gap.max(shortened.1));
+                }
+                played += gap.min(MAX_GAP);
+                let offset = played;
                 let (Body::Ready(bytes) | Body::Jpeg(bytes)) = &body;
                 paces.entry(topic).or_default().add(offset, bytes.len());
                 RecordedMessage { topic, offset, body }
@@ -402,6 +446,7 @@ impl RawRecording {
         // Every topic keeps at least its own gap between the last message of a loop and the first
         // of the next.
         let gap = paces.values().filter_map(Pace::mean_gap).max().unwrap_or(SINGLE_PERIOD);
+        let gap = gap.min(MAX_GAP);
         let period = duration + gap;
         let topics = self
             .topics
@@ -416,6 +461,7 @@ impl RawRecording {
                     messages: pace.count,
                     max_bytes: topic.decoded_bytes.unwrap_or(pace.max_bytes),
                     rate_hz: pace.count as f64 / period.as_secs_f64(),
+                    durability: topic.durability,
                     mean_gap: pace.mean_gap().unwrap_or(period),
                 }
             })
@@ -427,6 +473,8 @@ impl RawRecording {
             period,
             skipped: self.skipped,
             unusable_messages: self.unusable,
+            cut: self.cut,
+            shortened,
         }
     }
 }

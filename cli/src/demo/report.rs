@@ -55,8 +55,8 @@ pub struct Report<Out, Err> {
     style: Style,
     out: Out,
     err: Err,
-    /// Lines of the live table that stand on the screen.
-    drawn: usize,
+    /// The live table that stands on the screen.
+    drawn: String,
 }
 
 #[derive(Serialize)]
@@ -69,7 +69,7 @@ enum Line<'a> {
 impl<Out: Write, Err: Write> Report<Out, Err> {
     /// A report that has printed nothing yet.
     pub fn new(style: Style, out: Out, err: Err) -> Self {
-        Self { style, out, err, drawn: 0 }
+        Self { style, out, err, drawn: String::new() }
     }
 
     /// Something happened, in a sentence.
@@ -80,8 +80,9 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
         let line = format!("{:5.1} s  {text}\n", at.as_secs_f64());
         match self.style {
             Style::Live { .. } => {
+                // The table stays below what is told.
                 let clear = self.clear();
-                write_text(&mut self.out, &format!("{clear}{line}"))
+                write_text(&mut self.out, &format!("{clear}{line}{}", self.drawn))
             }
             Style::Lines => write_text(&mut self.out, &line),
             Style::Json => write_text(&mut self.err, &line),
@@ -97,8 +98,8 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
             Style::Live { width } => {
                 let text = live_table(at, rows, width);
                 let clear = self.clear();
-                self.drawn = text.lines().count();
-                write_text(&mut self.out, &format!("{clear}{text}"))
+                self.drawn = text;
+                write_text(&mut self.out, &format!("{clear}{}", self.drawn))
             }
             Style::Lines if at.as_secs().is_multiple_of(LINES_PERIOD_S) => {
                 let text: String = rows.iter().map(|row| plain_line(at, row)).collect();
@@ -120,6 +121,7 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
             Style::Lines => None,
         };
         let clear = self.clear();
+        self.drawn.clear();
         write_text(&mut self.out, &format!("{clear}{}", summary_text(summary, width)))
     }
 
@@ -130,8 +132,8 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
     }
 
     /// Moves to the first line of the table that stands there and clears to the end of the screen.
-    fn clear(&mut self) -> String {
-        match std::mem::take(&mut self.drawn) {
+    fn clear(&self) -> String {
+        match self.drawn.lines().count() {
             0 => String::new(),
             lines => format!("\x1b[{lines}A\r\x1b[0J"),
         }

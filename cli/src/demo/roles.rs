@@ -9,7 +9,7 @@
 use std::time::Duration;
 
 use blaze_domain::node_file::LARGE_BYTES;
-use blaze_domain::{Reliability, Scope, TopicName};
+use blaze_domain::{Durability, Reliability, Scope, TopicName};
 
 use super::flows::Spot;
 use super::options::DemoNode;
@@ -17,6 +17,8 @@ use super::recording::{RecordedTopic, Recording};
 
 /// How long a picture is of use.
 pub const PICTURE_LIFESPAN: Duration = Duration::from_millis(500);
+/// Messages of a topic that are kept for those who come later, at most.
+const MAX_KEPT: usize = 100;
 /// The service that moves at half time.
 pub const MOVING_SERVICE: &str = "analytics";
 /// Where it starts.
@@ -41,6 +43,8 @@ pub struct PlayedTopic {
     pub rate_hz: f64,
     /// Largest payload.
     pub max_bytes: usize,
+    /// Messages kept for those who come later; 0 = none.
+    pub depth: u32,
     /// Whether it is larger than [`LARGE_BYTES`], as pictures are: best effort, with a lifespan.
     pub large: bool,
 }
@@ -61,8 +65,18 @@ impl PlayedTopic {
             encoding: topic.encoding.clone(),
             rate_hz: topic.rate_hz,
             max_bytes: topic.max_bytes,
+            depth: match topic.durability {
+                Durability::TransientLocal => kept(topic.messages),
+                Durability::Volatile => 0,
+            },
             large,
         }
+    }
+
+    /// Whether messages are kept for those who come later.
+    #[must_use]
+    pub fn durability(&self) -> Durability {
+        if self.depth > 0 { Durability::TransientLocal } else { Durability::Volatile }
     }
 
     /// Pictures may be lost, everything else is repaired.
@@ -76,6 +90,12 @@ impl PlayedTopic {
     pub fn lifespan(&self) -> Duration {
         if self.large { PICTURE_LIFESPAN } else { Duration::ZERO }
     }
+}
+
+/// How many messages of a topic are kept: several publishers may have spoken once each, and play as
+/// one.
+fn kept(messages: usize) -> u32 {
+    u32::try_from(messages.clamp(1, MAX_KEPT)).unwrap_or(1)
 }
 
 /// Topics of all recordings, in their order: first of the first recording first.
@@ -120,10 +140,12 @@ pub fn scope_of(service: &str, node: DemoNode) -> Scope {
     }
 }
 
-/// The topic of the service that moves: the first that is not large, else the first.
+/// The topic of the service that moves: of an IMU, else the fastest that is not large, else the first.
 fn moving_topic(topics: &[PlayedTopic]) -> Option<&PlayedTopic> {
     let imu = topics.iter().find(|topic| topic.service == "imu-driver");
-    imu.or_else(|| topics.iter().find(|topic| !topic.large)).or(topics.first())
+    let small = topics.iter().filter(|topic| !topic.large);
+    let fastest = small.max_by(|one, other| one.rate_hz.total_cmp(&other.rate_hz));
+    imu.or(fastest).or(topics.first())
 }
 
 /// Everybody who listens on the given nodes.

@@ -294,7 +294,7 @@ impl<S: Stage> Session<'_, S> {
             return Ok(());
         };
         let (from, to) = (MOVES_FROM.flow(), MOVES_TO.flow());
-        if self.board.received(joined) == 0 {
+        if self.board.received(joined) == 0 && self.board.is_due(joined) {
             self.faults.push(format!("{MOVING_SERVICE} got nothing on {to} when it moved there"));
         }
         if let Err(fault) = self.stage.stop_listening(leaves).await {

@@ -104,6 +104,7 @@ impl System {
         let publish = PublishOptions {
             encoding: topic.encoding.clone(),
             reliability: topic.reliability(),
+            depth: topic.depth,
             lifespan: topic.lifespan(),
             large: topic.large,
             ..PublishOptions::default()
@@ -116,6 +117,8 @@ impl System {
             encoding: topic.encoding.clone(),
             type_name: topic.type_name.clone(),
             reliability: topic.reliability(),
+            durability: topic.durability(),
+            depth: topic.depth.max(1),
             lifespan: topic.lifespan(),
             ..Advertise::new(topic.name.clone())
         };
@@ -166,7 +169,11 @@ impl Stage for EndableSystem {
             .filter(|_| system.configuration.is_some())
             .map(|analytics| analytics.follow(&service));
         let takes = analytics.clone();
-        let options = SubscribeOptions { large: topic.large, ..SubscribeOptions::default() };
+        let options = SubscribeOptions {
+            large: topic.large,
+            with_kept: topic.depth > 0,
+            ..SubscribeOptions::default()
+        };
         let subscription = service
             .broker()
             .subscribe(&topic.name, options, move |message| {
@@ -183,6 +190,8 @@ impl Stage for EndableSystem {
         let request = Request {
             type_name: topic.type_name.clone(),
             reliability: topic.reliability(),
+            durability: topic.durability(),
+            depth: topic.depth.max(1),
             lifespan: topic.lifespan(),
             ..Request::new(topic.name.clone())
         };

@@ -22,6 +22,7 @@ pub(in crate::demo) fn good_row(topic: &str, node: DemoNode, service: &'static s
         latency_ms: LatencyMs { p50: Some(1.25), p99: Some(4.5) },
         large,
         active: true,
+        due: true,
         silent: Some(Duration::from_millis(20)),
     }
 }
@@ -143,6 +144,19 @@ fn each_fault_is_found() {
             summary.problems
         );
     }
+}
+
+#[test]
+fn what_was_not_published_need_not_arrive() {
+    let mut outcome = good_outcome();
+    outcome.topics[0] = TopicRow { received: 0, due: false, ..outcome.topics[0].clone() };
+    let mut joined = good_row("imu/data", MOVES_TO, MOVING_SERVICE);
+    (joined.received, joined.due) = (0, false);
+    outcome.topics.push(joined);
+    outcome.moved = None;
+    outcome.plan = None;
+    outcome.changes = Changes::default();
+    assert_eq!(judge(outcome).problems, [""; 0]);
 }
 
 #[test]
