@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_domain::node_file::{ControlPlaneSection, StoreSection};
+use blaze_runtime::admin::say_listening;
 use blaze_runtime::supervisor::{ShutdownSteps, Supervisor, TaskPolicy, failed};
 use blaze_runtime::{ready_line, say};
 
@@ -255,6 +256,7 @@ async fn serve(supervisor: &Supervisor, setup: Setup) -> ExitCode {
         Ok(main) => Arc::new(main),
         Err(error) => return failed(NAME, format_args!("{error:#}")),
     };
+    say_listening(main.admin());
     let (announced, stopping, failing) =
         (Arc::clone(&main), supervisor.stopping_token(), supervisor.clone());
     supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {

@@ -85,6 +85,12 @@ impl RunningMain {
         Ok(Self { readiness, admin, built })
     }
 
+    /// Where it is asked for its state, from the beginning.
+    #[must_use]
+    pub fn admin(&self) -> SocketAddr {
+        self.admin
+    }
+
     /// Waits until it serves, and says where. It waits for ever where the supervisor has failed
     /// before.
     pub async fn ready(&self) -> Addresses {

@@ -140,12 +140,16 @@ impl Shown {
 
 fn tell(readiness: &Readiness, status: &Status) {
     let revision = format!("revision {}", status.revision);
+    let with_others = match &status.beside[..] {
+        [] => revision.clone(),
+        others => format!("{revision}; other workers of this node run: {}", others.join(", ")),
+    };
     match status.is_ready {
         true => readiness.set("configuration", CheckStatus::Ok, revision.clone()),
         false => readiness.set("configuration", CheckStatus::Failed, NOTHING),
     }
     match (status.in_sync, &status.reason) {
-        (true, _) => readiness.set("main service", CheckStatus::Ok, revision),
+        (true, _) => readiness.set("main service", CheckStatus::Ok, with_others),
         (false, Some(reason)) => readiness.set("main service", CheckStatus::Failed, reason.clone()),
         (false, None) => readiness.set("main service", CheckStatus::Failed, "not in sync yet"),
     }

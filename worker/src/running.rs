@@ -70,6 +70,10 @@ pub struct RunningWorker {
     broker: Arc<dyn Broker>,
     hears_requests: Arc<AtomicBool>,
     has_main: bool,
+    worker_id: String,
+    rival: watch::Receiver<Option<String>>,
+    /// Of a worker that may be the only one of its node: whether it leads.
+    leads: Option<watch::Receiver<Option<u64>>>,
 }
 
 /// How the task that keeps the lease is ended, and says that it has.
@@ -101,6 +105,8 @@ impl RunningWorker {
             }
             None => (None, Leadership::alone()),
         };
+        let is_of_node = lease.is_some() && settings.site.node.is_some();
+        let leads = is_of_node.then(|| leadership.leader.clone());
         let speaker = Speaker::new(leadership.term.clone());
         let mut outlet = BrokerOutlet::new(Arc::clone(&broker));
         let records = keys.clone();
@@ -129,7 +135,7 @@ impl RunningWorker {
         let identity = Identity {
             site: settings.site.clone(),
             node: settings.node.clone(),
-            worker_id,
+            worker_id: worker_id.clone(),
             delivery: settings.delivery,
         };
         let outputs = Outputs {
@@ -214,6 +220,9 @@ impl RunningWorker {
             own,
             broker,
             hears_requests,
+            worker_id,
+            rival: leadership.rival,
+            leads,
         })
     }
 
@@ -224,10 +233,21 @@ impl RunningWorker {
         answer.await.ok()
     }
 
-    /// Whether services reach it on its broker: that answers, and what they say there is heard.
+    /// Whether services reach it on its broker: that answers, what they say there is heard, and no
+    /// other worker of the node serves instead.
     /// With words for people.
     #[must_use]
     pub fn reach(&self) -> (bool, String) {
+        if let Some(rival) = &*self.rival.borrow() {
+            let words = format!(
+                "another worker of this node was started later and serves: {rival}; this one is {}",
+                self.worker_id
+            );
+            return (false, words);
+        }
+        if self.leads.as_ref().is_some_and(|leads| leads.borrow().is_none()) {
+            return (false, "the lease of the node is not held yet".to_owned());
+        }
         let status = self.broker.status().borrow().clone();
         match (status.health, self.hears_requests.load(Ordering::Relaxed)) {
             (Health::Up, true) => (true, status.detail),

@@ -132,6 +132,8 @@ pub(crate) struct Worker {
     connection: Option<u64>,
     /// When it last said something.
     pub(crate) last_seen: Timestamp,
+    /// Where it is, as far as is known.
+    address: Option<IpAddr>,
     pub(crate) has: Acknowledged,
 }
 
@@ -188,7 +190,8 @@ impl Workers {
         });
         known.connections += 1;
         let connection = known.connections;
-        let worker = Worker { version, connection: Some(connection), last_seen: now, has };
+        let worker =
+            Worker { version, connection: Some(connection), last_seen: now, address: None, has };
         known.workers.insert(name.clone(), worker);
         Ok(WorkerSession {
             workers: Arc::clone(self),
@@ -203,6 +206,22 @@ impl Workers {
         let known = self.known.lock();
         let workers = known.workers.iter().filter(|(name, _)| wanted(name));
         workers.map(|(name, worker)| (name.clone(), worker.clone())).collect()
+    }
+
+    /// Other workers of the same layer and node that are connected: name and address, for people.
+    pub(crate) fn beside(&self, worker: &WorkerName) -> Vec<String> {
+        let first = WorkerName { id: String::new(), ..worker.clone() };
+        let known = self.known.lock();
+        let of_node = known
+            .workers
+            .range(first..)
+            .take_while(|(other, _)| (&other.layer, &other.node) == (&worker.layer, &worker.node));
+        let others = of_node.filter(|(name, other)| *name != worker && other.is_connected());
+        let place = |(name, other): (&WorkerName, &Worker)| match other.address {
+            Some(address) => format!("{} at {address}", name.id),
+            None => name.id.clone(),
+        };
+        others.map(place).collect()
     }
 
     /// What is said of a roll-out, by node, with the layer of the worker that says it. The node's
@@ -244,6 +263,9 @@ impl WorkerSession {
     /// The same with the address of the worker.
     pub(crate) fn with_address(mut self, address: IpAddr) -> Self {
         self.address = address;
+        if let Some(worker) = self.workers.known.lock().workers.get_mut(&self.name) {
+            worker.address = Some(address);
+        }
         self
     }
 
@@ -322,7 +344,9 @@ mod tests {
         let workers = Arc::new(Workers::default());
         let enter =
             |id| workers.enter(name(id), String::new(), Acknowledged::default(), at(1)).unwrap();
-        let (first, beside) = (enter("a"), enter("b"));
+        let first = enter("a").with_address(Ipv4Addr::LOCALHOST.into());
+        let beside = enter("b");
+        assert_eq!(workers.beside(beside.name()), ["a at 127.0.0.1"]);
         drop(first);
         let _next = enter("c");
         let ids: Vec<_> = workers.list(|_| true).into_iter().map(|(name, _)| name.id).collect();

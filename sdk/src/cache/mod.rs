@@ -88,7 +88,8 @@ pub enum Liveness {
     Alive,
     /// It cannot say so: Redis or the broker is away. It tries again.
     Silent,
-    /// A newer process of the same service, node and instance says so. This one does not any more.
+    /// A newer process of the same service, node and instance says so. This one does not until that
+    /// one has ended.
     Superseded,
     /// It said that it ends.
     Ended,

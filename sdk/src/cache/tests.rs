@@ -191,9 +191,15 @@ async fn of_two_processes_of_one_key_the_older_one_falls_silent() {
         assert_eq!(*newer.liveness().borrow(), Liveness::Alive);
         if has_keys {
             assert_eq!(world.keys.now(SLAM).unwrap()["epoch"], "8");
-            older.leave(Duration::from_secs(1)).await;
+            let third = world.service("slam", 6, has_keys);
+            third.set_state(ServiceState::Ready);
+            until(&third, Liveness::Superseded).await;
+            third.leave(Duration::from_secs(1)).await;
             assert!(world.keys.now(SLAM).is_some(), "the record is the newer one's");
         }
+        // As a failed update does.
+        newer.leave(Duration::from_secs(1)).await;
+        until(&older, Liveness::Alive).await;
     }
 }
 

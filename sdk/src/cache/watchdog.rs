@@ -21,7 +21,8 @@ const BATCH: usize = 256;
 /// What a last message counts: nothing is left to wait for.
 const OVER: Duration = Duration::from_millis(1);
 
-/// Runs until the service has ended or was superseded.
+/// Runs until the service has ended. One that was superseded goes on when the newer process has
+/// ended.
 pub(super) async fn run(shared: &Shared) {
     while !shared.said.lock().is_on {
         shared.wake.notified().await;
@@ -40,12 +41,6 @@ pub(super) async fn run(shared: &Shared) {
             Liveness::Ended
         }),
     };
-    if end == Liveness::Superseded {
-        tracing::warn!(
-            service = %shared.identity.service,
-            "a newer process of the same service, node and instance lives",
-        );
-    }
     shared.liveness.send_replace(end);
 }
 
@@ -59,14 +54,16 @@ async fn in_store(shared: &Shared, store: &dyn Store, key: &str) -> Liveness {
         let beaten = beat(shared, store, key, &said, is_first).await;
         is_first &= beaten.is_err();
         let next = match beaten {
-            Ok(true) if said.ending => return Liveness::Ended,
+            // What is left of it vanishes by itself.
+            _ if said.ending => return Liveness::Ended,
             Ok(true) => {
                 shared.show(Liveness::Alive);
                 shared.pace()
             }
-            Ok(false) => return Liveness::Superseded,
-            // What is left of it vanishes by itself.
-            Err(_) if said.ending => return Liveness::Ended,
+            Ok(false) => {
+                shared.show(Liveness::Superseded);
+                shared.pace()
+            }
             Err(error) => {
                 tracing::debug!(%error, "the sign of life could not be written");
                 shared.show(Liveness::Silent);
@@ -112,8 +109,27 @@ async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
     let mut others = subscribe(shared.broker.as_ref(), &channel).await?;
     let publisher = shared.broker.publisher(&channel, speaking(shared.broker.kind()))?;
     let mut heard = Vec::new();
+    let mut newer_until: Option<Instant> = None;
     loop {
         let said = shared.said.lock().clone();
+        newer_until = newer_until.filter(|until| *until > Instant::now());
+        if newer_until.is_some() && said.ending {
+            return Ok(Liveness::Ended);
+        }
+        if let Some(until) = newer_until {
+            shared.show(Liveness::Superseded);
+            tokio::select! {
+                () = tokio::time::sleep_until(until) => {}
+                () = shared.wake.notified() => {}
+                count = others.receive(&mut heard, BATCH) => {
+                    if count == 0 {
+                        return Err(BrokerError::Closed);
+                    }
+                    newer_until = newer(shared, &mut heard).or(newer_until);
+                }
+            }
+            continue;
+        }
         let ttl = if said.ending { OVER } else { shared.watchdog.ttl };
         let text = shared.sign(&said).message(ttl);
         let outcome = publisher.publish_bare(&Bytes::from(text), None);
@@ -132,14 +148,21 @@ async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
                     if count == 0 {
                         return Err(BrokerError::Closed);
                     }
-                    let own = &shared.identity;
-                    if signs_of(&mut heard).any(|sign| sign.is_of(own) && sign.epoch > own.epoch) {
-                        return Ok(Liveness::Superseded);
+                    newer_until = newer(shared, &mut heard);
+                    if newer_until.is_some() {
+                        break;
                     }
                 }
             }
         }
     }
+}
+
+/// Until when the last sign of life of a newer process counts, if there is one among the messages.
+fn newer(shared: &Shared, heard: &mut Vec<Received>) -> Option<Instant> {
+    let own = &shared.identity;
+    let signs = signs_of(heard).filter(|sign| sign.is_of(own) && sign.epoch > own.epoch);
+    signs.last().map(|sign| Instant::now() + sign.ttl)
 }
 
 impl Shared {
@@ -148,7 +171,14 @@ impl Shared {
     }
 
     fn show(&self, liveness: Liveness) {
-        self.liveness.send_if_modified(|shown| std::mem::replace(shown, liveness) != liveness);
+        let is_new =
+            self.liveness.send_if_modified(|shown| std::mem::replace(shown, liveness) != liveness);
+        if is_new && liveness == Liveness::Superseded {
+            tracing::warn!(
+                service = %self.identity.service,
+                "a newer process of the same service, node and instance lives",
+            );
+        }
     }
 
     fn sign(&self, said: &Said) -> Sign<'_> {

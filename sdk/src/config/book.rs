@@ -6,6 +6,8 @@
 //!                        deleted   ▼ │   newer revision
 //!                                Deleted
 //!
+//! Of another store of the main service any revision is newer: it was made anew, or restored.
+//!
 //! asks: at once ─► again 1 s later without an answer ─► 60 s after an answer, with the hash
 //! ```
 
@@ -14,7 +16,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::Scope;
 use blaze_domain::config::diff::{diff, paths};
 
-use super::change::{ConfigChange, ConfigScope, Held};
+use super::change::{ConfigChange, ConfigScope, ConfigSource, Held};
 use super::wire::{self, Answer, Notice, Refusal};
 use crate::service::Identity;
 
@@ -36,6 +38,8 @@ pub(super) enum Standing {
     Deleted {
         /// When.
         revision: u64,
+        /// Store that the revision is of.
+        store: Option<String>,
     },
 }
 
@@ -52,8 +56,23 @@ impl Standing {
         match self {
             Self::Nothing => None,
             Self::Held(held) => Some(held.revision),
-            Self::Deleted { revision } => Some(*revision),
+            Self::Deleted { revision, .. } => Some(*revision),
         }
+    }
+
+    fn store(&self) -> Option<&str> {
+        match self {
+            Self::Nothing => None,
+            Self::Held(held) => held.store.as_deref(),
+            Self::Deleted { store, .. } => store.as_deref(),
+        }
+    }
+
+    /// Whether it is of another store than what the main service has now. A copy may be of an
+    /// earlier one.
+    fn is_of_another_store(&self, store: Option<&str>, source: ConfigSource) -> bool {
+        let both = self.store().zip(store);
+        source == ConfigSource::Main && both.is_some_and(|(own, theirs)| own != theirs)
     }
 }
 
@@ -153,16 +172,18 @@ impl ConfigBook {
                 }
                 self.take(held, None, now)
             }
-            Answer::Unchanged { revision, hash, source } => {
+            Answer::Unchanged { revision, hash, source, store } => {
                 self.answered(now);
+                let is_other = self.standing.is_of_another_store(store.as_deref(), source);
                 let Standing::Held(held) = &mut self.standing else {
                     return None;
                 };
                 // The hash may be that of an earlier request; then the answer says nothing of what
                 // there is now.
-                if held.hash == hash && revision >= held.revision {
+                if held.hash == hash && (is_other || revision >= held.revision) {
                     held.revision = revision;
                     held.source = source;
+                    held.store = store;
                 }
                 None
             }
@@ -189,7 +210,7 @@ impl ConfigBook {
         }
         match notice.held {
             Some(held) => self.take(held, Some((notice.paths, notice.scopes)), now),
-            None => self.delete(notice.revision),
+            None => self.delete(notice.revision, notice.store, notice.source),
         }
     }
 
@@ -217,13 +238,15 @@ impl ConfigBook {
         told: Option<(Vec<String>, Vec<ConfigScope>)>,
         now: Instant,
     ) -> Option<ConfigChange> {
+        let is_other = self.standing.is_of_another_store(new.store.as_deref(), new.source);
         let is_older = match &self.standing {
+            _ if is_other => false,
             Standing::Nothing => false,
             Standing::Held(old) => new.revision < old.revision,
             // At the revision that deleted it, a configuration is one of before. All that a mounted
             // file says is of revision 0, and comes in its order.
-            Standing::Deleted { revision: 0 } => false,
-            Standing::Deleted { revision } => new.revision <= *revision,
+            Standing::Deleted { revision: 0, .. } => false,
+            Standing::Deleted { revision, .. } => new.revision <= *revision,
         };
         if is_older {
             self.counts.older += 1;
@@ -260,12 +283,18 @@ impl ConfigBook {
         })
     }
 
-    fn delete(&mut self, revision: u64) -> Option<ConfigChange> {
-        if self.standing.revision().is_some_and(|own| revision < own) {
+    fn delete(
+        &mut self,
+        revision: u64,
+        store: Option<String>,
+        source: ConfigSource,
+    ) -> Option<ConfigChange> {
+        let is_other = self.standing.is_of_another_store(store.as_deref(), source);
+        if !is_other && self.standing.revision().is_some_and(|own| revision < own) {
             self.counts.older += 1;
             return None;
         }
-        let old = std::mem::replace(&mut self.standing, Standing::Deleted { revision });
+        let old = std::mem::replace(&mut self.standing, Standing::Deleted { revision, store });
         let old = old.held()?.config.clone();
         self.counts.changes += 1;
         Some(ConfigChange {

@@ -102,6 +102,36 @@ fn a_change_that_was_found_by_asking_says_what_is_different_and_may_be_of_any_sc
 }
 
 #[test]
+fn of_another_store_of_the_main_service_any_revision_is_newer() {
+    let (mut book, now) = ours();
+    let told = |store: &str, source: &str, mut notice: Value| {
+        notice["store_id"] = store.into();
+        notice["source"] = source.into();
+        bytes(&notice)
+    };
+    let rate = |rate: u64| json!({ "rate": rate });
+    assert!(book.on_notice(&told("a", "main", notice(8, &rate(1))), now).is_some());
+    let of_copy = told("b", "copy", notice(1, &rate(2)));
+    assert_eq!(book.on_notice(&of_copy, now), None, "a copy may be of an earlier store");
+    let change = book.on_notice(&told("b", "main", notice(3, &rate(2))), now).unwrap();
+    assert_eq!((change.revision, change.new), (3, Some(std::sync::Arc::new(rate(2)))));
+    assert_eq!(book.on_notice(&told("b", "main", notice(2, &rate(1))), now), None);
+    let unchanged = json!({
+        "id": "000000000000007f-1",
+        "unchanged": true,
+        "revision": 1,
+        "hash": hash(&rate(2)),
+        "source": "main",
+        "store_id": "c",
+    });
+    assert_eq!(book.on_reply(&bytes(&unchanged), now), None);
+    assert_eq!(book.standing().revision(), Some(1));
+    assert!(book.on_notice(&told("c", "main", notice(2, &rate(3))), now).is_some());
+    assert!(book.on_notice(&told("d", "main", deleted(1)), now).unwrap().deleted);
+    assert!(book.on_notice(&told("e", "main", notice(1, &rate(4))), now).is_some());
+}
+
+#[test]
 fn what_is_for_others_is_left_alone() {
     let (mut book, now) = ours();
     for (member, value) in [

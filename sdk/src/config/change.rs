@@ -13,6 +13,8 @@ pub(crate) struct Held {
     pub(crate) hash: String,
     pub(crate) config: Arc<Value>,
     pub(crate) source: ConfigSource,
+    /// Store that the revision is of, as far as its worker says.
+    pub(crate) store: Option<String>,
 }
 
 /// Without the configuration, for it may hold texts of secrets.
@@ -126,6 +128,7 @@ pub(super) mod tests {
             hash: "sha256:a".to_owned(),
             config: change.new.unwrap(),
             source: ConfigSource::Main,
+            store: None,
         };
         assert!(!format!("{held:?}").contains("geheim"));
     }

@@ -103,7 +103,7 @@ impl Shown {
 
     fn missing(&self) -> ConfigError {
         match &self.standing {
-            Standing::Deleted { revision } => ConfigError::Deleted { revision: *revision },
+            Standing::Deleted { revision, .. } => ConfigError::Deleted { revision: *revision },
             Standing::Held(_) | Standing::Nothing if self.closed => ConfigError::Closed,
             Standing::Held(_) | Standing::Nothing => ConfigError::NotReady {
                 reason: self.refusal.clone().unwrap_or_else(|| "no worker answered".to_owned()),

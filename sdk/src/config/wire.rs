@@ -25,7 +25,7 @@ pub(super) struct Refusal {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Answer {
     Given { held: Held, node: Option<String> },
-    Unchanged { revision: u64, hash: String, source: ConfigSource },
+    Unchanged { revision: u64, hash: String, source: ConfigSource, store: Option<String> },
     Refused(Refusal),
 }
 
@@ -38,6 +38,8 @@ pub(super) struct Notice {
     pub(super) revision: u64,
     /// `None`: the service was deleted.
     pub(super) held: Option<Held>,
+    pub(super) store: Option<String>,
+    pub(super) source: ConfigSource,
     pub(super) paths: Vec<String>,
     pub(super) scopes: Vec<ConfigScope>,
 }
@@ -54,6 +56,7 @@ struct Members {
     hash: Option<String>,
     config: Option<Value>,
     source: Option<String>,
+    store_id: Option<String>,
     #[serde(default)]
     unchanged: bool,
     #[serde(default)]
@@ -90,6 +93,7 @@ impl Members {
             source: self.source(),
             config: Arc::new(self.config.take().filter(Value::is_object)?),
             hash: self.hash.take()?,
+            store: self.store_id.clone(),
         })
     }
 }
@@ -108,6 +112,7 @@ pub(super) fn answer(payload: &[u8], id_prefix: &str) -> Option<Answer> {
             revision: members.revision?,
             source: members.source(),
             hash: members.hash?,
+            store: members.store_id,
         });
     }
     let held = members.held()?;
@@ -117,6 +122,7 @@ pub(super) fn answer(payload: &[u8], id_prefix: &str) -> Option<Answer> {
 /// Reads a notice; `None` if it is none.
 pub(super) fn notice(payload: &[u8]) -> Option<Notice> {
     let mut members = Members::read(payload)?;
+    let source = members.source();
     let held = match members.deleted {
         true => None,
         false => Some(members.held()?),
@@ -127,6 +133,8 @@ pub(super) fn notice(payload: &[u8]) -> Option<Notice> {
         node: members.node,
         revision: members.revision?,
         held,
+        store: members.store_id,
+        source,
         paths: members.paths,
         scopes: members.scopes.iter().filter_map(|word| word.parse().ok()).collect(),
     })
@@ -189,12 +197,13 @@ mod tests {
             "node": "robot-1", "revision": 431,
             "hash": "sha256:a", "config": {"a": 1}, "source": "copy",
             "as_of": "2026-11-21T07:01:12.345Z", "age_s": 3.1,
-            "rollout": null});
+            "rollout": null, "store_id": "0197"});
         let held = Held {
             revision: 431,
             hash: "sha256:a".to_owned(),
             config: Arc::new(json!({"a": 1})),
             source: ConfigSource::Copy,
+            store: Some("0197".to_owned()),
         };
         let node = Some("robot-1".to_owned());
         assert_eq!(read(&given), Some(Answer::Given { held, node }));
@@ -206,8 +215,8 @@ mod tests {
             "source": "main",
         });
         let (hash, source) = ("sha256:a".to_owned(), ConfigSource::Main);
-        let revision = 431;
-        assert_eq!(read(&unchanged), Some(Answer::Unchanged { revision, hash, source }));
+        let (revision, store) = (431, None);
+        assert_eq!(read(&unchanged), Some(Answer::Unchanged { revision, hash, source, store }));
         let refused =
             json!({"id": "7f-3", "error": {"code": "not_found", "detail": "no service slamm"}});
         let (code, detail) = ("not_found".to_owned(), "no service slamm".to_owned());

@@ -4,7 +4,8 @@
 //! ask ──► Asking ──answer ok──► Held ──► renews at a third of its time to live
 //!           │ ▲ sends again with backoff      │
 //!           │ └──────────── new terms ────────┤
-//!           └─ refused ─► gone                └─ last holder leaves ─► Leaving ─ answer, or given up ─► gone
+//!           └─ refused ─► gone                ├─ a newer process has it ─► Superseded: asks on, until that one has ended
+//!                                             └─ last holder leaves ─► Leaving ─ answer, or given up ─► gone
 //! ```
 
 use std::collections::HashMap;
@@ -69,6 +70,10 @@ enum State {
     /// `next` is absent for a lease without an end.
     Held {
         next: Option<Instant>,
+    },
+    /// A newer process of the service has the lease.
+    Superseded {
+        next: Instant,
     },
     Leaving {
         attempts: u32,
@@ -250,7 +255,9 @@ impl LeaseBook {
             let soon = now + RESEND_WITHIN.mul_f64((self.random)().clamp(0.0, 1.0));
             match &mut record.state {
                 State::Held { next } => *next = Some(next.map_or(soon, |next| next.min(soon))),
-                State::Asking { next, .. } | State::Leaving { next, .. } => {
+                State::Asking { next, .. }
+                | State::Superseded { next }
+                | State::Leaving { next, .. } => {
                     *next = (*next).min(soon);
                 }
             }
@@ -274,30 +281,34 @@ impl LeaseBook {
         if answer.ok {
             record.agreed = Some(Arc::clone(&record.asked));
             let lease = Duration::from_secs(answer.lease_s.unwrap_or(self.ttl_s).into());
-            if matches!(record.state, State::Asking { .. }) {
+            if matches!(record.state, State::Asking { .. } | State::Superseded { .. }) {
                 record.state = State::Held { next: (!lease.is_zero()).then(|| now + lease / 3) };
             }
             settle(&mut record, &Ok(()));
         } else {
             let refusal = refusal(answer);
-            tracing::warn!(
-                topic = %key.topic,
-                kind = ?key.kind,
-                error = %refusal,
-                "a flow refused a lease",
-            );
-            let superseded =
+            if !matches!(record.state, State::Superseded { .. }) {
+                tracing::warn!(
+                    topic = %key.topic,
+                    kind = ?key.kind,
+                    error = %refusal,
+                    "a flow refused a lease",
+                );
+            }
+            let is_superseded =
                 matches!(&refusal, FlowError::Refused { code: ErrorCode::StaleEpoch, .. });
-            let agreed = record.agreed.clone();
-            let Some(agreed) = agreed.filter(|_| !superseded) else {
+            let Some(agreed) = record.agreed.clone() else {
                 self.forget(record, &Err(refusal));
                 return;
             };
             // The terms that the flow agreed to before still stand.
             settle(&mut record, &Err(refusal));
             record.asked = agreed;
-            if matches!(record.state, State::Asking { .. }) {
-                record.state = State::Held { next: Some(now + self.renewal_pause()) };
+            let next = now + self.renewal_pause();
+            if is_superseded {
+                record.state = State::Superseded { next };
+            } else if matches!(record.state, State::Asking { .. } | State::Superseded { .. }) {
+                record.state = State::Held { next: Some(next) };
             }
         }
         self.records.insert(key, record);
@@ -325,7 +336,11 @@ impl LeaseBook {
     }
 
     fn renewal_pause(&self) -> Duration {
-        Duration::from_secs(self.ttl_s.into()) / 3
+        match self.ttl_s {
+            // A lease without an end.
+            0 => LONGEST_RETRY,
+            ttl_s => Duration::from_secs(ttl_s.into()) / 3,
+        }
     }
 
     fn send(&mut self, key: &LeaseKey, now: Instant) -> Option<ControlMessage> {
@@ -340,6 +355,10 @@ impl LeaseBook {
             }
             State::Held { next } => {
                 *next = Some(now + renewal_pause);
+                false
+            }
+            State::Superseded { next } => {
+                *next = now + renewal_pause;
                 false
             }
             State::Leaving { attempts, .. } if *attempts >= WITHDRAW_ATTEMPTS => {
@@ -371,7 +390,7 @@ impl LeaseBook {
             Some(record) if record.generation == claim.generation => match record.state {
                 State::Asking { .. } if record.agreed.is_none() => LeaseState::Asking,
                 State::Asking { .. } | State::Held { .. } => LeaseState::Held,
-                State::Leaving { .. } => LeaseState::Ended,
+                State::Superseded { .. } | State::Leaving { .. } => LeaseState::Ended,
             },
             _ => LeaseState::Ended,
         }
@@ -414,7 +433,9 @@ impl LeaseBook {
 impl Record {
     fn next(&self) -> Option<Instant> {
         match self.state {
-            State::Asking { next, .. } | State::Leaving { next, .. } => Some(next),
+            State::Asking { next, .. }
+            | State::Superseded { next }
+            | State::Leaving { next, .. } => Some(next),
             State::Held { next } => next,
         }
     }

@@ -207,6 +207,26 @@ fn a_newer_process_of_the_same_identity_takes_the_lease() {
     let renewal = bench.after(5_000).remove(0);
     bench.answer(&renewal, STALE);
     assert_eq!(bench.book.state(&claim), LeaseState::Ended);
+    // Until that one has ended.
+    for _ in 0..3 {
+        assert!(bench.after(4_000).is_empty());
+        let asked = bench.after(1_000).remove(0);
+        bench.answer(&asked, STALE);
+    }
+    let asked = bench.after(5_000).remove(0);
+    bench.agree(&asked);
+    assert_eq!(bench.book.state(&claim), LeaseState::Held);
+    assert_eq!(bench.after(5_000).len(), 1);
+}
+
+#[test]
+fn one_that_begins_as_the_older_process_is_told_so() {
+    let mut bench = Bench::new();
+    let (claim, mut answered) = bench.ask("imu/data", 50.0);
+    let sent = bench.after(0).remove(0);
+    bench.answer(&sent, STALE);
+    assert!(matches!(answered.try_recv().unwrap(), Err(FlowError::Refused { .. })));
+    assert_eq!(bench.book.state(&claim), LeaseState::Ended);
     assert!(bench.after(60_000).is_empty());
 }
 

@@ -90,7 +90,8 @@ pub enum LeaseState {
     Asking,
     /// A flow agreed to it, and it is renewed.
     Held,
-    /// It was withdrawn, or a newer process of the same identity took it over.
+    /// It was withdrawn, or a newer process of the same identity has it; when that one has ended, it
+    /// is held again.
     Ended,
 }
 

@@ -1,5 +1,6 @@
 //! What a request gets.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use blaze_domain::config::effective::ConfigTarget;
@@ -39,6 +40,8 @@ pub enum Reply {
         hash: String,
         /// Where it comes from.
         source: Source,
+        /// Of which store.
+        store: Option<Arc<str>>,
     },
     /// None.
     Error(RequestError),
@@ -54,6 +57,7 @@ pub fn answer(served: &mut Served, request: &GetRequest, now: Instant) -> Reply 
             revision: standing.revision,
             hash: standing.hash,
             source: standing.source,
+            store: standing.store,
         },
         Ok(standing) => Reply::Standing(Box::new(standing)),
         Err(error) => Reply::Error(error),

@@ -76,7 +76,12 @@ fn everybody_gets_what_counts_where_it_runs() {
         // With the hash that it has now there is nothing to tell.
         let mut again = asked.clone();
         again["hash"] = standing.hash.as_str().into();
-        let unchanged = Reply::Unchanged { revision: 9, hash: standing.hash, source: Source::Copy };
+        let unchanged = Reply::Unchanged {
+            revision: 9,
+            hash: standing.hash,
+            source: Source::Copy,
+            store: None,
+        };
         assert_eq!(answer(&mut served, &request(&again), now), unchanged);
     }
 }

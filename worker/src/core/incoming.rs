@@ -62,6 +62,8 @@ pub enum Incoming {
         revision: u64,
         /// Digest of the view there; empty: not told.
         digest: String,
+        /// Other workers of the same layer and node that are connected, with their addresses.
+        beside: Vec<String>,
     },
     /// The stream is about to end.
     GoAway {

@@ -188,7 +188,7 @@ impl LayerView {
             Incoming::Commit { revision, previous, edits } => {
                 self.commit(revision, previous, edits)
             }
-            Incoming::Bookmark { revision, digest } => {
+            Incoming::Bookmark { revision, digest, beside: _ } => {
                 self.bookmark(revision, digest).map(|()| Applied::Nothing)
             }
         }

@@ -28,7 +28,7 @@ fn remove(revision: u64, previous: u64, document: Document) -> Incoming {
 }
 
 fn bookmark(revision: u64, digest: &str) -> Incoming {
-    Incoming::Bookmark { revision, digest: digest.to_owned() }
+    Incoming::Bookmark { revision, digest: digest.to_owned(), beside: Vec::new() }
 }
 
 /// Two nodes at revision 10, from a snapshot.

@@ -53,6 +53,8 @@ pub struct Standing {
     pub config: Config,
     /// Where it comes from.
     pub source: Source,
+    /// Of which store: revisions of two stores cannot be compared. `None`: of a file.
+    pub store: Option<Arc<str>>,
     /// The roll-out that changed it.
     pub rollout: Option<DocumentName>,
 }
@@ -80,6 +82,8 @@ pub struct Notice {
     pub config: Option<Config>,
     /// Where it comes from.
     pub source: Source,
+    /// Of which store: revisions of two stores cannot be compared. `None`: of a file.
+    pub store: Option<Arc<str>>,
     /// The roll-out that changed it.
     pub rollout: Option<DocumentName>,
 }
@@ -100,6 +104,7 @@ impl Notice {
             hash,
             config,
             source: self.source,
+            store: self.store.clone(),
             rollout: self.rollout.clone(),
         })
     }

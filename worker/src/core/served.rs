@@ -18,6 +18,7 @@
 mod trial;
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 use std::time::Instant;
 
 use blaze_domain::config::Key;
@@ -48,6 +49,8 @@ pub struct Served {
     next: World,
     /// Documents that differ between the two, and failed roll-outs.
     pending: BTreeSet<Key>,
+    /// Of which store the next documents are.
+    store: Option<Arc<str>>,
     /// Where the next documents come from.
     rank: Option<Source>,
     /// Whether the stream from the main service is there and everything was told.
@@ -73,6 +76,7 @@ impl Served {
             shown: World::default(),
             next: World::default(),
             pending: BTreeSet::new(),
+            store: None,
             rank: None,
             in_sync: false,
             floor: 0,
@@ -130,6 +134,11 @@ impl Served {
         &self.next.failed
     }
 
+    /// Of which store the next documents are that are taken, unless they are of a file.
+    pub fn set_store(&mut self, store_id: Option<&str>) {
+        self.store = store_id.map(Arc::from);
+    }
+
     /// Takes documents from a copy or a file, unless what is served comes from a stronger source.
     /// Gives whether it did.
     pub fn load(&mut self, state: State, source: Source) -> bool {
@@ -155,6 +164,10 @@ impl Served {
 
     fn replace(&mut self, state: State, source: Source) {
         self.next.state = state;
+        self.next.store = match source {
+            Source::File => None,
+            Source::Copy | Source::Main => self.store.clone(),
+        };
         self.next.is_loaded = true;
         self.rank = Some(source);
     }
@@ -343,6 +356,7 @@ impl Served {
             scopes: Vec::new(),
             config: None,
             source: self.source().unwrap_or(Source::File),
+            store: self.next.store.clone(),
             rollout: None,
         };
         if let Some((new, hash)) = new {
@@ -422,6 +436,7 @@ impl Served {
             hash,
             config: Config::of(&sources),
             source: self.source().unwrap_or(Source::File),
+            store: self.shown.store.clone(),
             rollout: sources.rollout,
         }
     }

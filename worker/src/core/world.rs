@@ -14,6 +14,8 @@ use super::served_target::{ServedTarget, Site};
 #[derive(Clone, Default)]
 pub(super) struct World {
     pub(super) state: State,
+    /// Of which store; `None`: of none, or that is not known.
+    pub(super) store: Option<Arc<str>>,
     /// Uids of roll-outs that failed here, the oldest first: as long as the main service does not
     /// know, their change does not count here.
     pub(super) failed: Arc<Vec<String>>,

@@ -34,9 +34,10 @@ impl Engine {
                     return;
                 }
                 let text = messages::refusal(&error, id.as_deref());
-                // Who can be told which of its requests it was hears of it where answers go that
-                // nobody chose.
-                let to = reply_to.or_else(|| id.as_ref().and_then(|_| messages::default_reply()));
+                // Whoever says nothing that can be read hears of it where answers go that nobody
+                // chose.
+                let can_tell = id.is_some() || shared.is_none();
+                let to = reply_to.or_else(|| can_tell.then(messages::default_reply).flatten());
                 (to.map(|to| (to, id)), text)
             }
         };

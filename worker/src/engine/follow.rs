@@ -25,6 +25,26 @@ pub(super) struct CatchingUp {
     at_most: Instant,
 }
 
+/// Other workers of this node that the main service sees.
+#[derive(Debug, Default)]
+pub(super) struct Beside {
+    /// With their addresses.
+    pub(super) others: Vec<String>,
+    is_told: bool,
+}
+
+impl Beside {
+    /// Takes what the main service says, every 15 s. Whether it is to be told: the worker before
+    /// this one may still be among them at first.
+    fn note(&mut self, others: &[String]) -> bool {
+        let is_again = !others.is_empty() && self.others == others;
+        let is_new = is_again && !self.is_told;
+        self.is_told = is_again;
+        self.others = others.to_vec();
+        is_new
+    }
+}
+
 impl Engine {
     pub(super) fn on_sync(&mut self, event: SyncEvent) {
         match event {
@@ -40,6 +60,9 @@ impl Engine {
                 self.tell_copies_of_stream();
             }
             SyncEvent::Said(incoming) => {
+                if let Incoming::Bookmark { beside, .. } = &incoming {
+                    self.note_beside(beside);
+                }
                 let applied = self.view.apply(self.without_texts(incoming), now());
                 if matches!(applied, Ok(Applied::Nothing | Applied::Changed(_))) {
                     // Both understand each other: what was the matter before is so no more.
@@ -51,6 +74,7 @@ impl Engine {
                     Ok(Applied::Nothing) => {}
                     Ok(Applied::Changed(change)) => {
                         self.wants_all = false;
+                        self.served.set_store(self.view.store_id());
                         self.served.apply(&change);
                         self.note_services(change.keys.iter().map(Key::kind));
                         self.note_catching_up();
@@ -82,6 +106,7 @@ impl Engine {
                 self.wants_all |= is_unreadable;
                 // What ended it says more than that it has ended.
                 let reason = self.fault.take().unwrap_or(reason);
+                self.beside = Beside::default();
                 let was_there = self.stream.take().is_some();
                 self.tell_copies_of_stream();
                 if was_there || self.reason.as_ref() != Some(&reason) {
@@ -94,6 +119,23 @@ impl Engine {
                 self.catching_up = self.catching_up.filter(|wait| wait.until > Instant::now());
                 self.note_sync();
             }
+        }
+    }
+
+    /// Other workers of this node that the main service sees. One that has just ended may be among
+    /// them once.
+    fn note_beside(&mut self, beside: &[String]) {
+        if self.identity.site.node.is_none() {
+            // Those of a layer may share a node, and have a lease.
+            return;
+        }
+        if self.beside.note(beside) {
+            tracing::warn!(
+                this = self.identity.worker_id,
+                others = beside.join(", "),
+                "several workers of this node run: stop all but one, or give each node a name of \
+                    its own"
+            );
         }
     }
 

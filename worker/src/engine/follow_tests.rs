@@ -123,7 +123,7 @@ async fn what_is_due_is_not_put_off_by_what_keeps_coming() {
     for _ in 0..60 {
         while let Ok(room) = w.sync.try_reserve() {
             let (revision, digest) = (2, String::new());
-            room.send(SyncEvent::Said(Incoming::Bookmark { revision, digest }));
+            room.send(SyncEvent::Said(Incoming::Bookmark { revision, digest, beside: Vec::new() }));
         }
         tokio::time::advance(Duration::from_millis(50)).await;
     }

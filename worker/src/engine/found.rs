@@ -25,6 +25,7 @@ impl Engine {
             );
             let state = self.state_of(position.revision, documents);
             self.view = LayerView::from_copy(position.store_id, state.clone(), position.as_of);
+            self.served.set_store(self.view.store_id());
             self.served.take_later(state);
             self.note_texts_of_all();
             self.note_all_services();

@@ -85,6 +85,7 @@ pub struct Engine {
     stream: Option<CancellationToken>,
     /// Why there is no stream.
     reason: Option<String>,
+    beside: follow::Beside,
     /// Why the stream was ended from here.
     fault: Option<String>,
     /// The number of the term in which it leads.
@@ -136,6 +137,7 @@ impl Engine {
             look_at: now + LOOK,
             stream: None,
             reason: None,
+            beside: follow::Beside::default(),
             fault: None,
             leads: None,
             led_at: now,
@@ -174,6 +176,7 @@ impl Engine {
         self.take_notes(&loaded.notes);
         self.notes = loaded.notes;
         self.view = LayerView::from_copy(store_id, state.clone(), as_of);
+        self.served.set_store(self.view.store_id());
         self.served.load(state, Source::Copy);
         self.lacks_texts = lacks_texts(self.view.state());
         self.note_all_services();

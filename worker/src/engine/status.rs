@@ -26,6 +26,8 @@ pub struct Status {
     pub defaults_problem: Option<String>,
     /// Why there is no stream.
     pub reason: Option<String>,
+    /// Other workers of this node that are connected to the main service, with their addresses.
+    pub beside: Vec<String>,
 }
 
 impl Engine {
@@ -71,6 +73,7 @@ impl Engine {
             unwatched: self.gate.unwatched(),
             defaults_problem: self.defaults_problem.clone(),
             reason: self.reason.clone(),
+            beside: self.beside.others.clone(),
         }
     }
 

@@ -80,6 +80,10 @@ impl Outlet for Board {
         std::future::pending::<()>().await;
     }
 
+    async fn missing_keys(&self, _: &[String]) -> Result<Vec<String>, OutletError> {
+        Ok(Vec::new())
+    }
+
     async fn own_keys(&self) -> Result<Vec<String>, OutletError> {
         Ok(Vec::new())
     }

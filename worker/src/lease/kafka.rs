@@ -39,7 +39,11 @@ impl Lease for KafkaLease {
     async fn hold(&self, _time: Duration, told: Option<&Mark>) -> Result<Held, String> {
         let text = told.map(Mark::to_text);
         let held = self.lease.hold(text.as_deref()).await?;
-        Ok(Held { is_held: held.is_held, told: held.note.as_deref().and_then(Mark::parse) })
+        Ok(Held {
+            is_held: held.is_held,
+            told: held.note.as_deref().and_then(Mark::parse),
+            by: None,
+        })
     }
 
     async fn release(&self) {

@@ -8,7 +8,8 @@
 //!
 //! It lies in the layer's MongoDB ([`MongoLease`]), else in Redis ([`RedisLease`]), else it is
 //! membership of a consumer group on the layer's Kafka ([`KafkaLease`]). Beside it lies how far
-//! services were told ([`Mark`]): the worker that takes over tells the rest.
+//! services were told ([`Mark`]): the worker that takes over tells the rest. A node on Redis has a
+//! lease for the case that two workers run under its name: the one that was started last serves.
 
 #[cfg(feature = "conformance")]
 pub mod conformance;
@@ -44,6 +45,8 @@ pub struct Held {
     pub is_held: bool,
     /// How far services were told; `None`: nobody knows.
     pub told: Option<Mark>,
+    /// On a node, where one is meant to run: the worker that has it instead, for people.
+    pub by: Option<String>,
 }
 
 /// Where the lease lies.
@@ -85,6 +88,7 @@ pub async fn keep(lease: Arc<dyn Lease>, time: Duration, holder: &mut Holder) {
         match tokio::time::timeout(renew, lease.hold(held, told.as_ref())).await {
             Ok(Ok(answer)) => {
                 holder.note(answer.told);
+                holder.note_rival(answer.by);
                 until = answer.is_held.then(|| asked + held);
             }
             Ok(Err(error)) => tracing::debug!(error, "nobody knows who has the lease"),

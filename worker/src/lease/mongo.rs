@@ -58,6 +58,7 @@ impl Lease for MongoLease {
             Ok(Some(found)) => Ok(Held {
                 is_held: found.get_str("owner").is_ok_and(|owner| owner == self.owner),
                 told: mark(&found),
+                by: None,
             }),
             // Two made the document at once, and the other one was first.
             Ok(None) => Ok(Held::default()),

@@ -1,7 +1,7 @@
 //! From the settings of a worker to the lease of its layer.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context as _;
 use blaze_brokers::redis::RedisKeys;
@@ -11,9 +11,8 @@ use blaze_domain::node_file::{DatabaseSection, KafkaBroker, LayerBroker, SecretT
 use super::{Lease, RedisLease};
 use crate::settings::{LocalBroker, WorkerSettings};
 
-/// The lease of the worker's layer: in its MongoDB, else in Redis, else on its Kafka. `None`: on
-/// the broker of a node there is one worker; on that of a layer without any of these it must be
-/// alone.
+/// The lease of the worker's layer: in its MongoDB, else in Redis, else on its Kafka; or that of its
+/// node, on the Redis of that. `None`: it must be alone.
 ///
 /// # Errors
 /// A section that can never work, or that this program was not built for.
@@ -22,10 +21,14 @@ pub fn open(
     keys: Option<&Arc<RedisKeys>>,
     worker_id: &str,
 ) -> anyhow::Result<Option<Arc<dyn Lease>>> {
-    let LocalBroker::Layer(broker) = &settings.broker else {
-        return Ok(None);
-    };
     let layer = &settings.site.layer;
+    let broker = match (&settings.broker, keys) {
+        (LocalBroker::Node(_), Some(keys)) if settings.keys_on_broker() => {
+            return Ok(Some(of_node(settings, keys, worker_id)));
+        }
+        (LocalBroker::Node(_), _) => return Ok(None),
+        (LocalBroker::Layer(broker), _) => broker,
+    };
     let lease = match (&settings.database, keys, broker) {
         (Some(DatabaseSection::MongoDb { uri, database }), _, _) => {
             mongodb(uri, database, layer, worker_id).context("database.mongodb")?
@@ -44,6 +47,15 @@ pub fn open(
         "of the workers of the layer, the one with the lease serves"
     );
     Ok(Some(lease))
+}
+
+fn of_node(settings: &WorkerSettings, keys: &Arc<RedisKeys>, worker_id: &str) -> Arc<dyn Lease> {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let worker = format!("{worker_id} on {}, process {}", host.trim(), std::process::id());
+    let started = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let started_ms = u64::try_from(started.as_millis()).unwrap_or(0);
+    let place = (&settings.site.layer, &settings.node);
+    Arc::new(RedisLease::of_node(Arc::clone(keys), place, started_ms, &worker))
 }
 
 #[cfg(feature = "mongodb")]

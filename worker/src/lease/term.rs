@@ -60,6 +60,7 @@ pub struct Holder {
     term: Term,
     noted: watch::Sender<Option<Mark>>,
     told: watch::Receiver<Option<Mark>>,
+    rival: watch::Sender<Option<String>>,
     /// How often it began to lead.
     terms: u64,
 }
@@ -75,6 +76,8 @@ pub struct Leadership {
     pub noted: watch::Receiver<Option<Mark>>,
     /// How far this worker has told them, for whoever follows; `None`: nothing new.
     pub told: watch::Sender<Option<Mark>>,
+    /// On a node: another worker, which was started later and serves instead, for people.
+    pub rival: watch::Receiver<Option<String>>,
 }
 
 /// Both sides, for a worker that is one of several.
@@ -83,9 +86,10 @@ pub fn leadership() -> (Holder, Leadership) {
     let (leader, led) = watch::channel(None);
     let (noted, notes) = watch::channel(None);
     let (tell, told) = watch::channel(None);
+    let (rival, rivals) = watch::channel(None);
     let term = Term::over();
-    let holder = Holder { leader, term: term.clone(), noted, told, terms: 0 };
-    let leadership = Leadership { leader: led, term, noted: notes, told: tell };
+    let holder = Holder { leader, term: term.clone(), noted, told, rival, terms: 0 };
+    let leadership = Leadership { leader: led, term, noted: notes, told: tell, rival: rivals };
     (holder, leadership)
 }
 
@@ -98,6 +102,7 @@ impl Leadership {
             term: Term::always(),
             noted: watch::channel(None).1,
             told: watch::channel(None).0,
+            rival: watch::channel(None).1,
         }
     }
 }
@@ -118,6 +123,21 @@ impl Holder {
             }
             is_new
         });
+    }
+
+    /// Another worker of the node serves instead, or none does.
+    pub(super) fn note_rival(&self, rival: Option<String>) {
+        let is_new = *self.rival.borrow() != rival;
+        if is_new {
+            if let Some(other) = &rival {
+                tracing::warn!(
+                    other,
+                    "another worker of this node was started later and serves: stop one, or give \
+                        it a node of its own"
+                );
+            }
+            self.rival.send_replace(rival);
+        }
     }
 
     /// It leads until then, or not.

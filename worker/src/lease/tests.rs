@@ -38,7 +38,7 @@ impl Lease for OnServer {
             *self.server.told.lock() = Some(told.clone());
         }
         let told = self.server.told.lock().clone();
-        Ok(Held { is_held, told })
+        Ok(Held { is_held, told, by: None })
     }
 
     async fn release(&self) {

@@ -118,6 +118,12 @@ pub trait Outlet: Send + Sync + 'static {
 
     /// Waits until the server of the keys may have lost them: it was away and is back.
     async fn keys_lost(&self);
+
+    /// Those of some keys that the server has not: it may evict them, or somebody deletes them.
+    ///
+    /// # Errors
+    /// [`OutletError`].
+    async fn missing_keys(&self, keys: &[String]) -> Result<Vec<String>, OutletError>;
 }
 
 /// Channels that are there before anybody listens, on brokers where they are to be made.
@@ -297,6 +303,13 @@ impl Outlet for BrokerOutlet {
         match &self.keys {
             Some(keys) => keys.client.restarted().await,
             None => std::future::pending().await,
+        }
+    }
+
+    async fn missing_keys(&self, wanted: &[String]) -> Result<Vec<String>, OutletError> {
+        match &self.keys {
+            Some(keys) => Ok(keys.client.missing(wanted).await?),
+            None => Ok(Vec::new()),
         }
     }
 }

@@ -2,6 +2,7 @@
 //! what waits, only the newest of each place counts. A broker that is away holds up nobody; what
 //! waits then is bounded by the places that there are.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -27,6 +28,8 @@ const ASIDE: Duration = Duration::from_millis(200);
 /// A server of the keys that is not the broker's and does not answer is left alone for so long,
 /// which doubles: notices go on meanwhile.
 const KEYS_AGAIN: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
+/// Between two looks whether the server has the keys.
+const LOOK_FOR_KEYS: Duration = Duration::from_secs(10);
 /// Between two tries to look for keys of before.
 const SWEEP_AGAIN: Duration = Duration::from_secs(5);
 
@@ -137,6 +140,38 @@ impl Speaker {
         tokio::select! {
             () = self.speak(&*outlet) => {}
             () = lost => {}
+            () = self.look_for_keys(&*outlet) => {}
+        }
+    }
+
+    /// Writes keys again that the server has lost while it ran, for ever.
+    async fn look_for_keys(&self, outlet: &dyn Outlet) {
+        let mut before = BTreeSet::new();
+        loop {
+            tokio::time::sleep(LOOK_FOR_KEYS).await;
+            let wanted = self.shared.state.lock().settled_keys();
+            if wanted.is_empty() || !self.term.is_on() {
+                continue;
+            }
+            let missing = match outlet.missing_keys(&wanted).await {
+                Ok(missing) => missing.into_iter().collect(),
+                Err(error) => {
+                    tracing::debug!(%error, "it is not known which keys are there");
+                    BTreeSet::new()
+                }
+            };
+            // Twice running, as what is on its way is not there yet.
+            let lost: BTreeSet<String> = before.intersection(&missing).cloned().collect();
+            before = missing;
+            if !lost.is_empty() {
+                tracing::warn!(
+                    keys = ?lost.iter().take(4).collect::<Vec<_>>(),
+                    count = lost.len(),
+                    "the server has lost keys: they are written again",
+                );
+                self.shared.state.lock().write_again(&lost);
+                self.shared.more.notify_one();
+            }
         }
     }
 

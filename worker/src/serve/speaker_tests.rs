@@ -21,6 +21,8 @@ struct Fake {
     missing: Option<&'static str>,
     /// Whether the server of the keys, another one, answers.
     has_keys: watch::Receiver<bool>,
+    /// Keys that it has lost, as long as nobody writes them.
+    evicted: Arc<Mutex<BTreeSet<String>>>,
 }
 
 #[async_trait]
@@ -51,6 +53,7 @@ impl Outlet for Fake {
         if changes.iter().any(|change| change.key() == "blaze:config:forbidden") {
             return Err(OutletError::KeysAlone(KeyError::Refused { place, reason }));
         }
+        self.evicted.lock().retain(|key| changes.iter().all(|change| change.key() != key.as_str()));
         self.delivered.send((changes.to_vec(), messages.to_vec())).await.unwrap();
         Ok(())
     }
@@ -66,6 +69,11 @@ impl Outlet for Fake {
     async fn own_keys(&self) -> Result<Vec<String>, OutletError> {
         Ok(self.own.clone())
     }
+
+    async fn missing_keys(&self, keys: &[String]) -> Result<Vec<String>, OutletError> {
+        let evicted = self.evicted.lock();
+        Ok(keys.iter().filter(|key| evicted.contains(*key)).cloned().collect())
+    }
 }
 
 struct World {
@@ -73,6 +81,7 @@ struct World {
     up: watch::Sender<bool>,
     keys: watch::Sender<bool>,
     lost: Arc<Notify>,
+    evicted: Arc<Mutex<BTreeSet<String>>>,
     delivered: mpsc::Receiver<Delivered>,
     _run: tokio::task::JoinSet<()>,
 }
@@ -81,6 +90,7 @@ fn world(is_up: bool) -> World {
     let (up, seen) = watch::channel(is_up);
     let (keys, has_keys) = watch::channel(true);
     let (send, delivered) = mpsc::channel(64);
+    let evicted = Arc::default();
     let (speaker, lost) = (Speaker::new(Term::always()), Arc::new(Notify::new()));
     let outlet = Arc::new(Fake {
         is_up: seen,
@@ -90,10 +100,11 @@ fn world(is_up: bool) -> World {
         refused: Some("blaze/config/changed/refused"),
         missing: Some("blaze/config/changed/missing"),
         has_keys,
+        evicted: Arc::clone(&evicted),
     });
     let mut run = tokio::task::JoinSet::new();
     run.spawn(speaker.clone().run(outlet));
-    World { speaker, up, keys, lost, delivered, _run: run }
+    World { speaker, up, keys, lost, evicted, delivered, _run: run }
 }
 
 fn told(place: &str, text: &'static str) -> Told {
@@ -148,6 +159,21 @@ async fn keys_that_the_server_has_lost_are_written_again_without_a_notice() {
     assert_eq!(again, (vec![slam], Vec::new()));
     let swept = w.delivered.recv().await.unwrap();
     assert_eq!(swept, (vec![old], Vec::new()), "and one that nobody wants goes");
+}
+
+#[tokio::test(start_paused = true)]
+async fn keys_that_vanish_while_the_server_runs_are_written_again() {
+    let mut w = world(true);
+    w.speaker.tell([told("slam", "1"), told("nav", "1")]);
+    w.delivered.recv().await.unwrap();
+    let evicted = Instant::now();
+    w.evicted.lock().insert("blaze:config:slam".to_owned());
+    let again = w.delivered.recv().await.unwrap();
+    let slam = KeyChange::Put { key: "blaze:config:slam".to_owned(), value: Bytes::from("1") };
+    assert_eq!(again, (vec![slam], Vec::new()));
+    assert!(evicted.elapsed() <= LOOK_FOR_KEYS * 3);
+    tokio::time::sleep(LOOK_FOR_KEYS * 3).await;
+    assert!(w.delivered.try_recv().is_err(), "it is there again");
 }
 
 #[test]

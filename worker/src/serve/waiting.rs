@@ -199,6 +199,16 @@ impl State {
         self.sweep = true;
     }
 
+    /// Keys that the server should have, if nothing is on its way to it.
+    pub(super) fn settled_keys(&self) -> Vec<String> {
+        self.wanted.keys().filter(|key| !self.dirty.contains(*key)).cloned().collect()
+    }
+
+    /// These keys are to be written again, if they are still wanted.
+    pub(super) fn write_again(&mut self, keys: &BTreeSet<String>) {
+        self.dirty.extend(keys.iter().filter(|key| self.wanted.contains_key(*key)).cloned());
+    }
+
     /// Of the keys that are there, those that should not be.
     pub(super) fn drop_unwanted(&mut self, found: Vec<String>) {
         let unwanted = found.into_iter().filter(|key| !self.wanted.contains_key(key));

@@ -54,9 +54,11 @@ impl TryFrom<v1::SyncResponse> for Incoming {
             }),
             Msg::Snapshot(snapshot) => from_snapshot(snapshot),
             Msg::Commit(commit) => from_commit(commit),
-            Msg::Bookmark(bookmark) => {
-                Ok(Self::Bookmark { revision: bookmark.revision, digest: bookmark.digest })
-            }
+            Msg::Bookmark(bookmark) => Ok(Self::Bookmark {
+                revision: bookmark.revision,
+                digest: bookmark.digest,
+                beside: bookmark.beside,
+            }),
             Msg::GoAway(go_away) => Ok(Self::GoAway {
                 retry_after: Duration::from_millis(go_away.retry_after_ms.into()),
                 reason: go_away.reason,

@@ -199,8 +199,8 @@ fn response(item: SyncItem, request_id: &str) -> Option<Result<v1::SyncResponse,
             last,
         }),
         SyncItem::Commit(commit) => Told::Commit(outgoing::commit(&commit)),
-        SyncItem::Bookmark { revision, digest } => {
-            Told::Bookmark(v1::Bookmark { revision, digest })
+        SyncItem::Bookmark { revision, digest, beside } => {
+            Told::Bookmark(v1::Bookmark { revision, digest, beside })
         }
         SyncItem::GoAway { retry_after_ms, reason } => {
             Told::GoAway(v1::GoAway { retry_after_ms, reason })

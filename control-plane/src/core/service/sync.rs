@@ -104,6 +104,8 @@ pub enum SyncItem {
         revision: u64,
         /// Of what the layer sees then; empty where that cannot be told any more.
         digest: String,
+        /// Other workers of the same layer and node that are connected, for people.
+        beside: Vec<String>,
     },
     /// The stream ends well: come again.
     GoAway {
@@ -218,9 +220,8 @@ impl ConfigService {
             false => self.snapshot(state, hello.layer.clone(), clear.clone()),
         };
         let watch = self.inner.watches.open_stored(caller, &hello.layer, since);
-        let service = self.clone();
-        let told =
-            watch.flat_map(move |item| stream::iter(service.told(&hello.layer, &clear, item)));
+        let (service, name) = (self.clone(), session.name().clone());
+        let told = watch.flat_map(move |item| stream::iter(service.told(&name, &clear, item)));
         let first = stream::iter([welcome]);
         Ok(SyncStream {
             items: first.chain(snapshot).chain(told).boxed(),
@@ -295,7 +296,7 @@ impl ConfigService {
     }
 
     /// What an item of the watch is to a worker.
-    fn told(&self, layer: &LayerName, clear: &Clear, item: WatchItem) -> Vec<SyncItem> {
+    fn told(&self, name: &WorkerName, clear: &Clear, item: WatchItem) -> Vec<SyncItem> {
         let go_away = |reason: &str| SyncItem::GoAway {
             retry_after_ms: rand::rng().random_range(AGAIN_MS),
             reason: reason.to_owned(),
@@ -304,8 +305,12 @@ impl ConfigService {
             WatchItem::Commit(commit) => vec![SyncItem::Commit(clear.commit(&commit))],
             WatchItem::Bookmark(revision) => {
                 let state = self.inner.log.state_at(revision);
-                let digest = state.map(|state| self.inner.digests.of(&state, layer));
-                vec![SyncItem::Bookmark { revision, digest: digest.unwrap_or_default() }]
+                let digest = state.map(|state| self.inner.digests.of(&state, &name.layer));
+                vec![SyncItem::Bookmark {
+                    revision,
+                    digest: digest.unwrap_or_default(),
+                    beside: self.inner.workers.beside(name),
+                }]
             }
             WatchItem::End(None) => {
                 vec![go_away("the stream has been open for long"), SyncItem::End(None)]

@@ -72,7 +72,7 @@ impl Copy {
         let wait = async {
             loop {
                 match self.items.next().await {
-                    Some(SyncItem::Bookmark { revision: at, digest }) => {
+                    Some(SyncItem::Bookmark { revision: at, digest, .. }) => {
                         self.revision = self.revision.max(at);
                         assert_eq!(digest, self.digest(), "at {at}");
                         if at >= revision {

@@ -20,16 +20,19 @@ const FIRST_ON_KAFKA: Duration = Duration::from_secs(10);
 
 async fn run_on_redis(kind: RedisKind) {
     let server = RedisServer::start(kind, RedisOptions::default()).unwrap();
+    let lease = |layer: &str, owner: &str| -> Arc<dyn Lease> {
+        Arc::new(RedisLease::new(keys_on(&server), &layer.parse().unwrap(), owner.to_owned()))
+    };
+    run_all(&lease, BUSY).await.unwrap();
+}
+
+fn keys_on(server: &RedisServer) -> Arc<RedisKeys> {
     let file =
         json!({ "brokers": { "node": { "redis": { "url": server.url(), "prefix": "x:" } } } });
     let Some(NodeBroker::Redis(section)) = NodeFile::read(&file).unwrap().0.brokers.node else {
         panic!("no Redis in {file}");
     };
-    let lease = |layer: &str, owner: &str| -> Arc<dyn Lease> {
-        let keys = Arc::new(RedisKeys::open(&section).unwrap());
-        Arc::new(RedisLease::new(keys, &layer.parse().unwrap(), owner.to_owned()))
-    };
-    run_all(&lease, BUSY).await.unwrap();
+    Arc::new(RedisKeys::open(&section).unwrap())
 }
 
 async fn run_on_mongo(uri: &str, database: &str) -> Result<(), String> {
@@ -54,6 +57,34 @@ async fn one_on_redis_passes_the_suite() {
     for kind in [RedisKind::Redis, RedisKind::Valkey] {
         run_on_redis(kind).await;
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn of_two_workers_of_a_node_the_one_that_was_started_last_serves() {
+    let server = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
+    let (layer, node) = ("edge".parse().unwrap(), "robot-1".parse().unwrap());
+    let lease = |started_ms: u64, worker: &str| {
+        RedisLease::of_node(keys_on(&server), (&layer, &node), started_ms, worker)
+    };
+    let (older, newer) = (lease(9, "w1 on a"), lease(10, "w2 on b"));
+    let hold = async |lease: &RedisLease| {
+        let held = lease.hold(TIME, None).await.unwrap();
+        (held.is_held, held.by)
+    };
+    assert_eq!(hold(&older).await, (true, None));
+    assert_eq!(hold(&newer).await, (true, None), "at once");
+    assert_eq!(hold(&older).await, (false, Some("w2 on b".to_owned())));
+    assert_eq!(hold(&newer).await, (true, None));
+    newer.release().await;
+    assert_eq!(hold(&older).await, (true, None));
+    // One that was killed.
+    let killed = Instant::now();
+    assert_eq!(hold(&newer).await, (true, None));
+    while !hold(&older).await.0 {
+        assert!(killed.elapsed() < TIME + BUSY);
+        tokio::time::sleep(TIME / 50).await;
+    }
+    assert!(killed.elapsed() >= TIME);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -76,8 +76,8 @@ pub struct GetRequest {
 pub struct RefusedRequest {
     /// Is echoed, if it could be read.
     pub id: Option<String>,
-    /// Where the refusal goes; `None`: nowhere, because the request does not say, or names a place
-    /// where answers must not go: whoever can send requests could otherwise write to any topic.
+    /// Where the refusal is to go; `None`: the request cannot be read, or names a place where
+    /// answers must not go: whoever can send requests could otherwise write to any topic.
     pub reply_to: Option<ChannelName>,
     /// What is wrong.
     pub error: RequestError,
@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_object_is_refused_without_an_answer() {
+    fn what_is_no_object_does_not_say_where_its_answer_goes() {
         let long = format!("{{\"id\":\"{}\"}}", "x".repeat(MAX_MESSAGE_BYTES));
         for bytes in [&b""[..], b"{", b"[]", b"7", b"\xff", b"{} {}", long.as_bytes()] {
             let refused = GetRequest::parse(bytes).unwrap_err();

@@ -21,6 +21,6 @@ mod write;
 pub use ack::ConfigAck;
 pub use fields::MAX_MESSAGE_BYTES;
 pub use get::{ErrorCode, GetRequest, RefusedRequest, RequestError, default_reply};
-pub use keys::{config_key, lease_key};
+pub use keys::{config_key, lease_key, node_lease_key};
 pub use watchdog::{DEFAULT_TTL_MS, Health, ServiceState, WatchdogKey};
 pub use write::{Delivery, TooLargeMessage, notice, refusal, reply, state_value};

@@ -89,10 +89,13 @@ pub fn reply(reply: &Reply, id: Option<&str>, delivery: Delivery, freshness: Fre
                 return refusal(&error, id);
             }
         },
-        Reply::Unchanged { revision, hash, source } => json!({
-            "unchanged": true, "revision": revision, "hash": hash,
-            "source": source.as_str(), "as_of": freshness.as_of(), "age_s": freshness.age_s(),
-        }),
+        Reply::Unchanged { revision, hash, source, store } => of_store(
+            json!({
+                "unchanged": true, "revision": revision, "hash": hash,
+                "source": source.as_str(), "as_of": freshness.as_of(), "age_s": freshness.age_s(),
+            }),
+            store.as_deref(),
+        ),
         Reply::Error(error) => return refusal(error, id),
     };
     with_id(id, members)
@@ -140,7 +143,15 @@ fn members(
     });
     // Afterwards, for it may be large: what stands in the macro is copied.
     out["config"] = delivery.sized(standing.config.value())?;
-    Ok(out)
+    Ok(of_store(out, standing.store.as_deref()))
+}
+
+/// Members with the store that they are of, if there is one.
+fn of_store(mut members: Value, store: Option<&str>) -> Value {
+    if let Some(store) = store {
+        members["store_id"] = store.into();
+    }
+    members
 }
 
 /// A notice, written at a time.
@@ -164,7 +175,7 @@ pub fn notice(
         members.shift_remove("deleted");
         members.insert("config".to_owned(), delivery.sized(config.value())?);
     }
-    Ok(out.to_string())
+    Ok(of_store(out, notice.store.as_deref()).to_string())
 }
 
 impl Freshness {

@@ -30,6 +30,7 @@ fn standing(config: &Value) -> Standing {
         hash: sources.hash(),
         config: Config::of(&sources),
         source: Source::Main,
+        store: None,
         rollout: None,
     }
 }
@@ -46,6 +47,7 @@ fn a_notice(config: Option<&Value>) -> Notice {
         scopes: standing.iter().flat_map(|_| [Scope::Layer, Scope::Service]).collect(),
         config: standing.map(|standing| standing.config),
         source: Source::Copy,
+        store: None,
         rollout: None,
     }
 }
@@ -65,8 +67,12 @@ fn an_answer_has_the_members_of_the_contract_in_their_order() {
     );
     assert_eq!(full, format!(r#"{{"id":"7f1c",{state}"#));
     assert_eq!(state_value(&standing, Delivery::Text, freshness()).unwrap(), format!("{{{state}"));
-    let unchanged =
-        Reply::Unchanged { revision: 431, hash: "sha256:ab".to_owned(), source: Source::File };
+    let unchanged = Reply::Unchanged {
+        revision: 431,
+        hash: "sha256:ab".to_owned(),
+        source: Source::File,
+        store: None,
+    };
     let never = Freshness { as_of: None, ..freshness() };
     assert_eq!(
         reply(&unchanged, None, Delivery::Text, never),
