@@ -1,6 +1,6 @@
 //! The BlazeFlow process: parse, build, run.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,13 +15,14 @@ use blaze_flow::flow::service::FlowService;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::world::LayerScopeId;
-use blaze_runtime::admin::Readiness;
+use blaze_runtime::admin::{Readiness, say_listening};
 use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_or_say, parse_override};
 use blaze_runtime::logs::{LogFormat, LogHandle};
+use blaze_runtime::state::StateDirectory;
 use blaze_runtime::supervisor::{
     ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, failed,
 };
-use blaze_runtime::{environment, logs, ready_line, say, state};
+use blaze_runtime::{environment, logs, ready_line, state};
 use clap::Parser;
 
 const NAME: &str = "blaze-flow";
@@ -59,14 +60,6 @@ fn main() -> ExitCode {
         Ok(loaded) => loaded,
         Err(code) => return code,
     };
-    if cfg!(not(feature = "kafka"))
-        && matches!(loaded.value.brokers.layer, Some(LayerSection::Kafka(_)))
-    {
-        say(format_args!(
-            "warning: brokers.layer.kafka: this program was built without Kafka (cargo feature \
-             `kafka`) and cannot start with it"
-        ));
-    }
     if arguments.check {
         return ExitCode::SUCCESS;
     }
@@ -126,22 +119,37 @@ async fn start(
 ) -> anyhow::Result<(RunningFlow, LogHandle)> {
     let format = if file.log.format.as_str() == "json" { LogFormat::Json } else { LogFormat::Text };
     let log = logs::init(file.log.level.as_str(), format)?;
-    let directory = state::state_directory(file.state_dir.as_deref())?;
-    if let Some(refused) = &directory.instead_of {
-        tracing::warn!(
-            directory = %directory.path.display(),
-            instead_of = refused,
-            "state is kept elsewhere",
-        );
-    }
+    let directory = state_directory(file.state_dir.as_deref());
     let settings = FlowSettings::try_from(file)?;
-    let epochs = Epochs::begin(&settings.me, Some(&directory.path)).context("keeping the epoch")?;
+    let epochs = Epochs::begin(&settings.me, Some(&directory));
     let role = Role::Flow { flow: settings.me.clone(), epoch: epochs.first() };
     let node = node_broker(file, &settings, &role)?;
     let (layer, layer_prefix) = layer_broker(file, &settings, &role)?;
-    let options = FlowOptions { settings, node, layer, state_dir: Some(directory.path) };
+    let options = FlowOptions { settings, node, layer, state_dir: Some(directory) };
     let beginning = Beginning { epochs, layer_prefix };
-    Ok((blaze_flow::flow::start_with(options, beginning, supervisor.clone()).await?, log))
+    let flow = blaze_flow::flow::start_with(options, beginning, supervisor.clone()).await?;
+    say_listening(flow.admin());
+    Ok((flow, log))
+}
+
+/// Where state is kept. A flow keeps its epoch alone, and starts without it where the disk is full.
+fn state_directory(configured: Option<&Path>) -> PathBuf {
+    match state::state_directory(configured) {
+        Ok(StateDirectory { path, instead_of }) => {
+            if let Some(refused) = instead_of {
+                tracing::warn!(
+                    directory = %path.display(),
+                    instead_of = refused,
+                    "state is kept elsewhere",
+                );
+            }
+            path
+        }
+        Err(error) => {
+            tracing::warn!(%error, "no state is kept");
+            configured.unwrap_or(Path::new(state::DEFAULT_DIRECTORY)).to_owned()
+        }
+    }
 }
 
 fn node_broker(

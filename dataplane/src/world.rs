@@ -290,7 +290,10 @@ pub struct Advertise {
     pub more_sources: bool,
 }
 
-/// A service that advertises.
+/// Services that ask for a topic, of which so many are named.
+pub const MAX_REQUESTERS: usize = 4;
+
+/// A service that advertises or requests.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Source {
     /// Its node; empty where a service of the layer names none.
@@ -320,6 +323,10 @@ pub struct Request {
     pub type_name: String,
     /// RIHS01 hash that is expected, or empty.
     pub type_hash: String,
+    /// Services that ask, sorted, at most [`MAX_REQUESTERS`]: for people.
+    pub services: Vec<Source>,
+    /// How many more there are.
+    pub more_services: u32,
     /// A service of this scope wants payloads with a header.
     pub framed: bool,
     /// A service of this scope wants bare payloads.

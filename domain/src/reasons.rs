@@ -90,6 +90,8 @@ word_enum!(
         BrokerDown = "broker_down",
         /// Another flow owns the scope.
         ScopeInUse = "scope_in_use",
+        /// Several programs run under the name of one flow.
+        NameInUse = "name_in_use",
         /// It flows natively, without a bridge.
         NativePath = "native_path",
     }

@@ -104,18 +104,46 @@ pub fn read_small(path: &Path) -> io::Result<Option<Vec<u8>>> {
     Ok(Some(content))
 }
 
+/// Why an epoch was not kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unkept {
+    /// For people.
+    pub reason: String,
+    /// The clock is behind the last epoch that was kept, so that the next life may get the same
+    /// one.
+    pub is_doubtful: bool,
+}
+
 /// The next epoch of the flow of a node: max(milliseconds since 1970, stored + 1), so that it grows
 /// although the clock may stand still or go back. Kept in `flow-epoch.<layer>.<node>`; two
-/// processes never get the same one.
-///
-/// # Errors
-/// Those of the file system, and one for names that cannot be part of a file name.
-pub fn next_epoch(directory: &Path, layer: &str, node: &str) -> io::Result<u64> {
+/// processes never get the same one, as long as it can be kept. Where the disk is full or cannot be
+/// written to, it is as good as the clock.
+#[must_use]
+pub fn next_epoch(directory: &Path, layer: &str, node: &str) -> (u64, Option<Unkept>) {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
     next_epoch_at(directory, layer, node, u64::try_from(now).unwrap_or(u64::MAX))
 }
 
-fn next_epoch_at(directory: &Path, layer: &str, node: &str, now_ms: u64) -> io::Result<u64> {
+fn next_epoch_at(directory: &Path, layer: &str, node: &str, now_ms: u64) -> (u64, Option<Unkept>) {
+    let mut stored = 0;
+    match keep_epoch(directory, layer, node, now_ms, &mut stored) {
+        Ok(epoch) => (epoch, None),
+        Err(error) => {
+            let reason = format!("{}: {error}", directory.display());
+            let unkept = Unkept { reason, is_doubtful: now_ms <= stored };
+            (now_ms.max(stored.saturating_add(1)), Some(unkept))
+        }
+    }
+}
+
+/// `stored` is what was kept last, also where nothing can be kept any more.
+fn keep_epoch(
+    directory: &Path,
+    layer: &str,
+    node: &str,
+    now_ms: u64,
+    stored: &mut u64,
+) -> io::Result<u64> {
     for name in [layer, node] {
         if name.is_empty() || !name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-') {
             return Err(io::Error::new(
@@ -125,6 +153,7 @@ fn next_epoch_at(directory: &Path, layer: &str, node: &str, now_ms: u64) -> io::
         }
     }
     let path = directory.join(format!("flow-epoch.{layer}.{node}"));
+    *stored = stored_epoch(&path)?;
     // The lock is on a file of its own, for the epoch's file is replaced. It ends with the handle.
     let lock = OpenOptions::new()
         .create(true)
@@ -133,16 +162,7 @@ fn next_epoch_at(directory: &Path, layer: &str, node: &str, now_ms: u64) -> io::
         .mode(0o600)
         .open(directory.join(format!("flow-epoch.{layer}.{node}.lock")))?;
     lock.lock()?;
-    let stored = match read_small(&path)? {
-        None => 0,
-        Some(content) => parse_epoch(&content).unwrap_or_else(|| {
-            tracing::warn!(
-                path = %path.display(),
-                "the stored epoch cannot be read and is taken from the clock",
-            );
-            0
-        }),
-    };
+    *stored = stored_epoch(&path)?;
     let Some(after_stored) = stored.checked_add(1) else {
         return Err(io::Error::new(
             io::ErrorKind::InvalidData,
@@ -152,6 +172,17 @@ fn next_epoch_at(directory: &Path, layer: &str, node: &str, now_ms: u64) -> io::
     let epoch = now_ms.max(after_stored);
     write_atomically(&path, format!("{epoch}\n").as_bytes())?;
     Ok(epoch)
+}
+
+fn stored_epoch(path: &Path) -> io::Result<u64> {
+    let Some(content) = read_small(path)? else { return Ok(0) };
+    Ok(parse_epoch(&content).unwrap_or_else(|| {
+        tracing::warn!(
+            path = %path.display(),
+            "the stored epoch cannot be read and is taken from the clock",
+        );
+        0
+    }))
 }
 
 fn parse_epoch(content: &[u8]) -> Option<u64> {
@@ -183,12 +214,17 @@ mod tests {
     #[test]
     fn epochs_only_grow() {
         let directory = tempfile::tempdir().unwrap();
-        let next = |now| next_epoch_at(directory.path(), "edge", "robot-1", now).unwrap();
+        let kept = |node, now| {
+            let (epoch, unkept) = next_epoch_at(directory.path(), "edge", node, now);
+            assert_eq!(unkept, None);
+            epoch
+        };
+        let next = |now| kept("robot-1", now);
         assert_eq!(next(1000), 1000);
         assert_eq!(next(1000), 1001);
         assert_eq!(next(5), 1002);
         assert_eq!(next(5000), 5000);
-        assert_eq!(next_epoch_at(directory.path(), "edge", "robot-2", 7).unwrap(), 7);
+        assert_eq!(kept("robot-2", 7), 7);
         assert_eq!(
             names(directory.path()),
             [
@@ -201,8 +237,29 @@ mod tests {
         fs::write(directory.path().join("flow-epoch.edge.robot-1"), "garbage").unwrap();
         assert_eq!(next(6000), 6000);
         fs::write(directory.path().join("flow-epoch.edge.robot-1"), u64::MAX.to_string()).unwrap();
-        assert!(next_epoch_at(directory.path(), "edge", "robot-1", 1).is_err());
-        assert!(next_epoch_at(directory.path(), "../edge", "robot-1", 1).is_err());
+        for layer in ["edge", "../edge"] {
+            let (_, unkept) = next_epoch_at(directory.path(), layer, "robot-1", 1);
+            assert!(unkept.is_some(), "{layer}");
+        }
+    }
+
+    #[test]
+    fn an_epoch_that_cannot_be_kept_is_as_good_as_the_clock() {
+        let directory = tempfile::tempdir().unwrap();
+        let next = |now| {
+            let (epoch, unkept) = next_epoch_at(directory.path(), "edge", "robot-1", now);
+            (epoch, unkept.map(|unkept| unkept.is_doubtful))
+        };
+        assert_eq!(next(1000), (1000, None));
+        // What stands in its way stands for a disk that is full: root may write everywhere.
+        let lock = directory.path().join("flow-epoch.edge.robot-1.lock");
+        fs::remove_file(&lock).unwrap();
+        fs::create_dir(&lock).unwrap();
+        assert_eq!(next(2000), (2000, Some(false)));
+        assert_eq!(next(2001), (2001, Some(false)));
+        assert_eq!(next(900), (1001, Some(true)));
+        fs::remove_dir(&lock).unwrap();
+        assert_eq!(next(2002), (2002, None));
     }
 
     #[test]
@@ -210,8 +267,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path();
         let mut epochs: Vec<u64> = std::thread::scope(|scope| {
-            let take =
-                || (0..20).map(|_| next_epoch_at(path, "l", "n", 1).unwrap()).collect::<Vec<_>>();
+            let take = || (0..20).map(|_| next_epoch_at(path, "l", "n", 1).0).collect::<Vec<_>>();
             let threads: Vec<_> = (0..4).map(|_| scope.spawn(take)).collect();
             threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect()
         });

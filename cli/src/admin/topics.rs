@@ -35,6 +35,16 @@ struct Lease {
     #[serde(default, deserialize_with = "super::text_or_null")]
     service: String,
     max_rate_hz: Option<f64>,
+    /// Those behind what another flow tells of a scope.
+    #[serde(default)]
+    services: Vec<Named>,
+    #[serde(default)]
+    more_services: u32,
+}
+
+#[derive(Debug, Deserialize)]
+struct Named {
+    service: String,
 }
 
 impl Lease {
@@ -45,6 +55,15 @@ impl Lease {
                 text.push('/');
                 text.push_str(part);
             }
+        }
+        if !self.services.is_empty() {
+            let mut names: Vec<&str> =
+                self.services.iter().map(|named| named.service.as_str()).collect();
+            names.dedup();
+            text.push_str(&format!("/{}", names.join("+")));
+        }
+        if self.more_services > 0 {
+            text.push_str(&format!(" and {} more", self.more_services));
         }
         if let Some(rate) = self.max_rate_hz {
             text.push_str(&format!(" (≤ {rate} Hz)"));
@@ -108,13 +127,15 @@ mod tests {
              }],
              "requested": [{"layer": "fog", "node": "fog-1", "service": "dashboard",
                  "max_rate_hz": 10},
-                           {"layer": "cloud", "node": "", "service": "recorder"}]},
+                           {"layer": "cloud", "node": "", "service": "", "more_services": 2,
+                 "services": [{"node": "", "service": "dashboard"},
+                              {"node": "", "service": "recorder"}]}]},
             {"topic": "odom", "state": "no_request", "rate_hz": null}]});
         assert_eq!(
             table(&flow(), &value, None).unwrap(),
             "flow edge/robot-1\n\
              TOPIC     STATE       RATE/Hz   BYTES/s  PUBLISHED BY             REQUESTED BY\n\
-             imu/data  flowing        49.9  16.1 KiB  edge/robot-1/imu-driver  fog/fog-1/dashboard (≤ 10 Hz),cloud/recorder\n\
+             imu/data  flowing        49.9  16.1 KiB  edge/robot-1/imu-driver  fog/fog-1/dashboard (≤ 10 Hz),cloud/dashboard+recorder and 2 more\n\
              odom      no_request        -         -  -                        -\n"
         );
     }

@@ -162,8 +162,7 @@ async fn start_flow(
     let failed = |error: String| CliError::Failed(format!("the flow does not start: {error}"));
     let settings =
         FlowSettings::try_from(file).map_err(|error| CliError::Usage(error.to_string()))?;
-    let epochs = Epochs::begin(&settings.me, folder)
-        .map_err(|error| failed(format!("its epoch: {error}")))?;
+    let epochs = Epochs::begin(&settings.me, folder);
     let role = Role::Flow { flow: FlowId::clone(&settings.me), epoch: epochs.first() };
     let options =
         FlowOptions { settings, node: Some(brokers.open(&role)?), layer: None, state_dir: None };

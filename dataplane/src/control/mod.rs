@@ -95,7 +95,7 @@ impl ControlCore {
             layer_scope: config.layer_scope,
             max_leases: 10_000,
             layer_answers_need_id: config.layer_answers_need_id,
-            layer_names: config.layer_names,
+            layer_names: config.layer_names.clone(),
             lease_stores: config.lease_stores.clone(),
             access: config.access.clone(),
             started: now,

@@ -19,7 +19,8 @@ use bytes::Bytes;
 use prost::Message as _;
 
 use super::{ControlCore, LISTEN, Output};
-use crate::link::kind_to_wire;
+use crate::link::{NameConflict, kind_to_wire};
+use crate::registry::SILENT;
 
 /// Between two Hellos.
 const HELLO_EVERY: Duration = Duration::from_millis(500);
@@ -43,6 +44,8 @@ pub(super) struct Replicas {
     next_hello: Option<Instant>,
     /// The epoch that the process began with.
     began: u64,
+    /// Another program that says Hello under the own name.
+    namesake: Option<Namesake>,
     /// Messages that could not be read.
     refused: u64,
     /// Messages that came faster than they could be read.
@@ -52,6 +55,27 @@ pub(super) struct Replicas {
 impl Replicas {
     pub(super) fn new(began: u64) -> Self {
         Self { began, ..Self::default() }
+    }
+
+    fn hear_namesake(&mut self, now: Instant, began: u64) {
+        let known = self.namesake.filter(|known| known.began == began && known.lives(now));
+        let first = known.map_or(now, |known| known.first);
+        self.namesake = Some(Namesake { began, first, last: now });
+    }
+}
+
+/// Another program that says Hello under the name of this flow.
+#[derive(Debug, Clone, Copy)]
+struct Namesake {
+    /// The epoch that it began with.
+    began: u64,
+    first: Instant,
+    last: Instant,
+}
+
+impl Namesake {
+    fn lives(&self, now: Instant) -> bool {
+        now.saturating_duration_since(self.last) < SILENT
     }
 }
 
@@ -78,6 +102,9 @@ impl ControlCore {
         };
         let me = &self.config.me;
         let for_me = channel.to.is_empty() || channel.to == me.to_string();
+        if from == *me && channel.began != self.replicas.began && matches!(body, Body::Hello(_)) {
+            self.replicas.hear_namesake(now, channel.began);
+        }
         if from == *me {
             // Not of an earlier life, which may still be on its way.
             if channel.began == self.replicas.began && matches!(body, Body::Hello(_)) {
@@ -103,6 +130,26 @@ impl ControlCore {
     /// The layer broker is away: that nothing is heard says nothing of who lives.
     pub fn excuse_replicas(&mut self, now: Instant) {
         self.registry.excuse_silence(now);
+    }
+
+    /// Another program that runs under the name of this flow on the layer broker. An older one
+    /// counts when it is heard for some time: what it has said may still be on its way after its
+    /// end.
+    #[must_use]
+    pub fn namesake(&self, now: Instant) -> Option<NameConflict> {
+        let other = self.replicas.namesake.filter(|other| other.lives(now))?;
+        let is_refused = other.began > self.replicas.began;
+        let flow = self.config.me.clone();
+        let goes_on = other.last.saturating_duration_since(other.first) >= SILENT;
+        (is_refused || goes_on).then(|| NameConflict {
+            detail: format!(
+                "2 programs run under the name {flow} on one layer broker: with the epochs {} \
+                    (this program) and {}",
+                self.replicas.began, other.began
+            ),
+            is_refused,
+            flow,
+        })
     }
 
     /// Messages on the channel of the layer broker that could not be read.

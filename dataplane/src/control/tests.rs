@@ -42,7 +42,7 @@ impl Bench {
             gateway: AutoBool::Auto,
             inter_scope: false,
             layer_answers_need_id: true,
-            layer_names: LayerNames::Kafka { prefix_bytes: 0 },
+            layer_names: LayerNames::Kafka { prefix: String::new() },
             lease_stores: BTreeSet::from(LOCAL),
             rules: PlanRules::default(),
             access: AccessRules::default(),

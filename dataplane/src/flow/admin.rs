@@ -195,6 +195,10 @@ fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) 
         "reliability": request.reliability, "durability": request.durability, "expires_in_s": null,
         "local": false,
         "flow": flow,
+        "services": request.services.iter().map(|service| json!({
+            "node": service.node, "service": service.service,
+        })).collect::<Vec<_>>(),
+        "more_services": request.more_services,
     })
 }
 

@@ -1,6 +1,7 @@
 //! Keeps `/readyz` true to brokers and link, and does what is due every few seconds.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::Health;
@@ -10,9 +11,10 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::inter::InterScope;
+use super::plane::wall_ms;
 use super::{LocalBrokers, Shared};
 use crate::control::Stage;
-use crate::link::{Engine, MAX_PEERS};
+use crate::link::{Engine, MAX_PEERS, NameConflict};
 use crate::world::FlowState;
 
 /// `why` looks at what happened during the last one to two of these.
@@ -35,10 +37,17 @@ pub(super) fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
     readiness
 }
 
-/// Keeps the checks of `/readyz` true to brokers and link, until the process ends.
-pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: CancellationToken) {
+/// Keeps the checks of `/readyz` true to brokers and link, until the process ends. `in_doubt`:
+/// the next life could have the same epoch.
+pub(super) async fn watch_health(
+    shared: Arc<Shared>,
+    ready: Arc<Notify>,
+    mut in_doubt: bool,
+    stop: CancellationToken,
+) {
     let mut listened = false;
     let mut marked = Instant::now();
+    let mut conflicts = Vec::new();
     loop {
         if marked.elapsed() >= MARK {
             marked = Instant::now();
@@ -70,6 +79,12 @@ pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: 
             };
             shared.readiness.set(check, state, detail);
         }
+        show_conflicts(&shared, &mut conflicts);
+        if in_doubt && wall_ms() > shared.epoch.load(Ordering::Relaxed) {
+            // The next life has another epoch, whether this one is kept or not.
+            in_doubt = false;
+            shared.readiness.set("epoch", CheckStatus::Ok, "");
+        }
         if let Some(inter) = &shared.inter {
             let (state, detail) = inter_check(&shared, inter, listened);
             shared.readiness.set("inter", state, detail);
@@ -80,6 +95,22 @@ pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: 
             () = ready.notified() => listened = true,
         }
     }
+}
+
+/// Shows flows whose name several programs have; `before` is what was shown last.
+fn show_conflicts(shared: &Shared, before: &mut Vec<NameConflict>) {
+    let conflicts = shared.name_conflicts();
+    if conflicts == *before {
+        return;
+    }
+    for conflict in conflicts.iter().filter(|conflict| !before.contains(conflict)) {
+        tracing::warn!(conflict = conflict.detail, "give each flow a name of its own");
+    }
+    let is_refused = conflicts.iter().any(|conflict| conflict.is_refused);
+    let state = if is_refused { CheckStatus::Failed } else { CheckStatus::Ok };
+    let details: Vec<&str> = conflicts.iter().map(|conflict| conflict.detail.as_str()).collect();
+    shared.readiness.set("name", state, details.join("; "));
+    *before = conflicts;
 }
 
 /// What the transport says, and how many flows found no place among the peers.

@@ -19,7 +19,7 @@ use super::plane::{News, Plane};
 use super::settings::InterSettings;
 use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport, Wire};
 use crate::link::transport::{Endpoint, SendOutcome};
-use crate::link::{DownReason, LinkEvent};
+use crate::link::{DownReason, LinkEvent, NameConflict};
 
 /// Between attempts to start a transport.
 const RETRY: Duration = Duration::from_secs(1);
@@ -220,6 +220,11 @@ impl InterScope {
     /// What the transport says of itself, while there is one.
     pub(crate) fn status(&self) -> Option<DdsStatus> {
         self.current().map(|transport| transport.status())
+    }
+
+    /// Names of flows that several programs on it have.
+    pub(crate) fn name_conflicts(&self) -> Vec<NameConflict> {
+        self.current().map_or_else(Vec::new, |transport| transport.name_conflicts())
     }
 
     /// Why it could not be joined; empty if nothing is wrong.

@@ -43,7 +43,7 @@ use anyhow::Context;
 use blaze_brokers::{Broker, BrokerKind};
 use blaze_domain::{FlowId, Priority, Scope};
 use blaze_proto::link::link_control::{Egress as SaidEgress, LayerScope};
-use blaze_runtime::admin::{AdminServer, Readiness};
+use blaze_runtime::admin::{AdminServer, CheckStatus, Readiness};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
@@ -52,7 +52,7 @@ use crate::codec::pool::{self, Spawner};
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
 use crate::limit::limiter::Limiter;
-use crate::link::{Engine, EngineConfig, Limits};
+use crate::link::{Engine, EngineConfig, Limits, NameConflict};
 use crate::registry::{LayerNames, peers_channel};
 use crate::world::LayerScopeId;
 use control_task::Leave;
@@ -116,6 +116,15 @@ impl Shared {
         self.hears[usize::from(scope == Scope::Layer)].load(Ordering::Relaxed)
     }
 
+    /// Names of flows that several programs have: on the inter scope, or on the layer broker.
+    fn name_conflicts(&self) -> Vec<NameConflict> {
+        let mut conflicts = self.inter.as_ref().map_or_else(Vec::new, InterScope::name_conflicts);
+        if !conflicts.iter().any(|conflict| conflict.flow == self.me) {
+            conflicts.extend(self.control.lock().namesake(Instant::now()));
+        }
+        conflicts
+    }
+
     /// Tells the link what its Hellos say of this flow's traffic, and the wall clock, which may
     /// have been set.
     fn tell_link(&self) {
@@ -165,10 +174,9 @@ pub struct Beginning {
 /// soon as the admin port listens; [`RunningFlow::ready`] waits for the rest.
 ///
 /// # Errors
-/// As [`start_with`], and when the epoch cannot be kept.
+/// As [`start_with`].
 pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Result<RunningFlow> {
-    let epochs = Epochs::begin(&options.settings.me, options.state_dir.as_deref())
-        .context("keeping the epoch")?;
+    let epochs = Epochs::begin(&options.settings.me, options.state_dir.as_deref());
     let beginning = Beginning { epochs, layer_prefix: String::new() };
     start_with(options, beginning, supervisor).await
 }
@@ -185,7 +193,7 @@ pub async fn start_with(
 ) -> anyhow::Result<RunningFlow> {
     let FlowOptions { settings, node, layer, .. } = options;
     let Beginning { epochs, layer_prefix } = beginning;
-    let epoch = epochs.first();
+    let (epoch, doubt) = (epochs.first(), epochs.doubt().map(str::to_owned));
     let now = Instant::now();
     let layer_scope = layer.as_ref().map(|layer| layer.id);
     let said_layer_scope = said_layer_scope(layer.as_ref());
@@ -224,7 +232,7 @@ pub async fn start_with(
         // Channels there are set up beforehand, so all answers share one.
         layer_answers_need_id: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)),
         layer_names: match layer_kind {
-            Some(BrokerKind::Kafka) => LayerNames::Kafka { prefix_bytes: layer_prefix.len() },
+            Some(BrokerKind::Kafka) => LayerNames::Kafka { prefix: layer_prefix },
             _ => LayerNames::Any,
         },
         lease_stores: brokers.lease_stores(),
@@ -240,6 +248,14 @@ pub async fn start_with(
     let control = ControlCore::new(config, now);
     let egress = Egress::new(settings.live.bandwidth.limit_bytes_per_s());
     let readiness = readiness(&brokers, inter.is_some());
+    let in_doubt = doubt.is_some();
+    if let Some(doubt) = doubt {
+        readiness.set(
+            "epoch",
+            CheckStatus::Failed,
+            format!("the clock is behind the last start, and that cannot be kept: {doubt}"),
+        );
+    }
     let shared = Arc::new(Shared {
         me: settings.me.clone(),
         layer_scope: said_layer_scope,
@@ -289,7 +305,7 @@ pub async fn start_with(
     supervisor.spawn(
         "health",
         TaskPolicy::Essential,
-        watch_health(Arc::clone(&shared), ready, supervisor.shutdown_token()),
+        watch_health(Arc::clone(&shared), ready, in_doubt, supervisor.shutdown_token()),
     );
     let pacer = match shared.inter.is_some() {
         true => Some(start_inter(&shared, &supervisor)?),

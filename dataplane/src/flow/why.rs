@@ -62,6 +62,7 @@ pub(super) async fn why(
         }
     };
     let bridges = bridge_facts(&shared, &topic);
+    let conflicts = shared.name_conflicts();
     let control = shared.control.lock();
     let nothing = TopicPlan::default();
     let verdict = explain(&WhyInput {
@@ -74,6 +75,7 @@ pub(super) async fn why(
         layer_broker: shared.brokers.layer.as_deref().map(broker_facts),
         routes: route_facts(&control, &topic),
         leases: lease_hints(&shared, &control, &topic),
+        conflicts,
     });
     drop(control);
     answer(&shared, serde_json::to_value(verdict).unwrap_or(Value::Null)).into_response()

@@ -26,6 +26,7 @@ use blaze_domain::{FlowId, Priority};
 use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 
+use super::namesakes::{Life, NameConflict, conflicts};
 use super::transport::{Endpoint, SendOutcome, TransportEvent};
 pub(crate) use wire::Wire;
 
@@ -107,6 +108,10 @@ struct Shared {
     discarded: Mutex<Vec<Arc<Writer>>>,
     /// When each participant was last heard on a link topic.
     heard: Mutex<HashMap<GuidPrefix, Instant>>,
+    /// Programs whose flow's name another one has, too, or this one.
+    namesakes: Mutex<Vec<Life>>,
+    /// This program, and since when it is there.
+    own: Mutex<Life>,
     /// Where each participant lives.
     homes: Mutex<HashMap<GuidPrefix, Vec<Ipv4Addr>>>,
     status: Mutex<DdsStatus>,
@@ -145,6 +150,12 @@ impl DdsTransport {
             writers: RwLock::default(),
             discarded: Mutex::default(),
             heard: Mutex::default(),
+            namesakes: Mutex::default(),
+            own: Mutex::new(Life {
+                endpoint: config.local.clone(),
+                addresses: vec![address],
+                since: Instant::now(),
+            }),
             homes: Mutex::default(),
             status: Mutex::default(),
             not_sent: AtomicU64::new(0),
@@ -191,6 +202,22 @@ impl DdsTransport {
         }
         status.detail = details.join("; ");
         status
+    }
+
+    /// Names of flows that several programs have.
+    #[must_use]
+    pub fn name_conflicts(&self) -> Vec<NameConflict> {
+        let others = self.shared.namesakes.lock();
+        if others.is_empty() {
+            return Vec::new();
+        }
+        let mut found = conflicts(&self.shared.own.lock(), &others, Instant::now());
+        if self.shared.remains.load(Ordering::Relaxed) > 0 {
+            // What is left of an own participant that hangs may still announce itself.
+            let own = &self.shared.config.local.flow;
+            found.retain(|conflict| conflict.is_refused || conflict.flow != *own);
+        }
+        found
     }
 
     /// Sends one datagram to one endpoint on the topic of a class. Never waits.

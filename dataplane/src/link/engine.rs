@@ -104,7 +104,8 @@ pub struct Engine {
     /// Flows that were heard in a place that they have no more: what their links carry has to be
     /// found out from below when they come back.
     pub(super) heard: LruCache<FlowId, ()>,
-    /// Flows that found no place, those first that wait longest.
+    /// Endpoints that found no place, and those of whose flows newer lives speak; those first that
+    /// wait longest.
     pub(super) waiting: VecDeque<Endpoint>,
     /// When it was last told that one found none.
     pub(super) refusal_told: Option<Instant>,
@@ -367,7 +368,7 @@ impl Engine {
     /// Flows that found no place among the peers, and wait for one.
     #[must_use]
     pub fn waiting_peers(&self) -> usize {
-        self.waiting.len()
+        self.waiting.iter().filter(|endpoint| self.known(&endpoint.flow).is_none()).count()
     }
 
     /// Counts since the start.

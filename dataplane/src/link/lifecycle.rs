@@ -14,8 +14,8 @@ use super::wire::SenderId;
 
 /// Missed flows that are kept; beyond that the one that is due next is forgotten.
 const MAX_MISSED: usize = 1_024;
-/// Flows without a place that are kept, so that they get one when it is free; beyond that the
-/// oldest gives way.
+/// Endpoints that are kept until there is a place for them, or until the newer life of the same flow
+/// has ended that speaks in their stead; beyond that the oldest gives way.
 const MAX_WAITING: usize = 256;
 /// How often it is told that a flow found no place.
 const REFUSAL_TOLD_EVERY: Duration = Duration::from_secs(60);
@@ -35,7 +35,7 @@ impl Engine {
     ///
     /// Returns whether it is wanted: not an older life, not this flow itself, and there is room.
     pub fn peer_discovered(&mut self, now: Instant, endpoint: Endpoint) -> bool {
-        let Some(at) = self.place_of(now, endpoint) else {
+        let Some(at) = self.place_of(now, endpoint, false) else {
             return false;
         };
         if let Some(peer) = &mut self.peers[at]
@@ -61,28 +61,50 @@ impl Engine {
         }
     }
 
-    /// The place of an endpoint, made if it is new; a newer life replaces an older one. `None`: an
-    /// older life, this flow itself, or no room.
-    pub(super) fn place_of(&mut self, now: Instant, endpoint: Endpoint) -> Option<usize> {
+    /// The place of an endpoint, made if it is new; a newer life replaces an older one, and an older
+    /// one that speaks now replaces a newer one that does not any more. `None`: an older life, this
+    /// flow itself, or no room.
+    pub(super) fn place_of(
+        &mut self,
+        now: Instant,
+        endpoint: Endpoint,
+        speaks: bool,
+    ) -> Option<usize> {
         if endpoint.flow == self.config.me {
             return None;
         }
-        if let Some(&at) = self.by_flow.get(&endpoint.flow) {
-            let known = self.peers[at].as_ref().map_or(0, |peer| peer.endpoint.epoch);
-            if endpoint.epoch == known {
+        let mut ended = None;
+        if let Some(&at) = self.by_flow.get(&endpoint.flow)
+            && let Some(peer) = &self.peers[at]
+        {
+            let known = peer.endpoint.clone();
+            if endpoint == known {
                 return Some(at);
             }
-            if endpoint.epoch < known {
+            if !self.may_enter(&endpoint, speaks) {
                 self.counters.stale += 1;
+                if endpoint.epoch < known.epoch {
+                    self.wait(endpoint);
+                }
                 return None;
             }
-            self.replace(now, at, DownReason::NewEpoch);
+            if endpoint.epoch > known.epoch {
+                let was_connected = peer.is_connected();
+                self.replace(now, at, DownReason::NewEpoch);
+                if was_connected {
+                    // It may go on, and the newer one may be a mistake that ends.
+                    self.wait(known);
+                }
+            } else {
+                ended = (peer.phase == Phase::Gone).then_some(known.epoch);
+                self.forget(at);
+            }
         }
         let Some(at) = self.free_place() else {
             self.refuse(now, endpoint);
             return None;
         };
-        self.waiting.retain(|waiting| waiting.flow != endpoint.flow);
+        self.waiting.retain(|waiting| *waiting != endpoint);
         let limits = [0, 1, 2].map(|class| SendLimits {
             queue_bytes: self.config.limits.queue_bytes[class],
             streams: self.config.limits.streams,
@@ -90,6 +112,7 @@ impl Engine {
         });
         let mut peer =
             Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
+        peer.ended = ended;
         peer.was_heard = self.heard.pop(&peer.endpoint.flow).is_some();
         let layer = &peer.endpoint.flow.layer;
         self.budgets.fit(now, layer, self.config.max_datagram, &mut peer.path);
@@ -131,8 +154,11 @@ impl Engine {
                 peers: self.config.limits.peers,
             });
         }
-        if let Some(known) = self.waiting.iter_mut().find(|known| known.flow == endpoint.flow) {
-            known.epoch = known.epoch.max(endpoint.epoch);
+        self.wait(endpoint);
+    }
+
+    fn wait(&mut self, endpoint: Endpoint) {
+        if self.waiting.contains(&endpoint) {
             return;
         }
         if self.waiting.len() >= MAX_WAITING {
@@ -141,10 +167,11 @@ impl Engine {
         self.waiting.push_back(endpoint);
     }
 
-    /// Gives places that are free to flows that found none.
-    fn admit_waiting(&mut self, now: Instant) {
-        while self.has_place()
-            && let Some(endpoint) = self.waiting.pop_front()
+    /// Takes those that wait and may be peers now.
+    pub(super) fn admit_waiting(&mut self, now: Instant) {
+        while let Some(at) =
+            self.waiting.iter().position(|endpoint| self.may_enter(endpoint, false))
+            && let Some(endpoint) = self.waiting.remove(at)
         {
             if self.peer_discovered(now, endpoint.clone()) {
                 self.ledger.events.push_back(LinkEvent::PeerAdmitted(endpoint));
@@ -152,8 +179,22 @@ impl Engine {
         }
     }
 
-    fn has_place(&self) -> bool {
-        self.peers.len() < self.config.limits.peers || self.peers.iter().any(Option::is_none)
+    /// Whether there is a place for an endpoint that has none: a free one, or that of another life
+    /// of the same flow, which is older or has ended. One that is silent, but may be back, gives way
+    /// to one that speaks alone.
+    fn may_enter(&self, endpoint: &Endpoint, speaks: bool) -> bool {
+        match self.by_flow.get(&endpoint.flow).and_then(|at| self.peers[*at].as_ref()) {
+            Some(peer) if peer.ended == Some(endpoint.epoch) => false,
+            Some(peer) => {
+                endpoint.epoch > peer.endpoint.epoch
+                    || peer.phase == Phase::Gone
+                    || (speaks && peer.phase == Phase::Down)
+            }
+            None => {
+                self.peers.len() < self.config.limits.peers
+                    || self.peers.iter().any(Option::is_none)
+            }
+        }
     }
 
     /// This flow begins a new life: peers are dropped and have to be found again. Those that are

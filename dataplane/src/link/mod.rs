@@ -21,6 +21,7 @@ pub mod dds;
 mod engine;
 mod event;
 mod lifecycle;
+mod namesakes;
 mod outgoing;
 mod peer;
 mod ranges;
@@ -44,5 +45,6 @@ pub use event::{
     Begun, DownReason, LaneId, LinkCounters, LinkEvent, PeerInfo, PeerState, StreamKey, Submit,
     Tally, Transmit,
 };
+pub use namesakes::NameConflict;
 pub use wire::{HEADER_BYTES, RECORD_BYTES};
 pub(crate) use wire::{class_code, class_of, kind_from_wire, kind_to_wire};

@@ -56,6 +56,8 @@ pub(crate) struct Peer {
     /// When it was found, or left.
     pub since: Instant,
     pub last_hello: Option<Instant>,
+    /// A newer life of this flow that has said Goodbye: late datagrams of it are ignored.
+    pub ended: Option<u64>,
     /// It has been up, in this place or in one before.
     pub was_heard: bool,
     pub hello: Option<Box<Hello>>,
@@ -97,6 +99,7 @@ impl Peer {
             phase: Phase::Connecting,
             since: now,
             last_hello: None,
+            ended: None,
             was_heard: false,
             hello: None,
             hello_at: now,

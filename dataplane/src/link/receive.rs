@@ -228,7 +228,7 @@ impl Engine {
             return;
         }
         let endpoint = Endpoint { flow: flow.clone(), epoch: hello.epoch };
-        let Some(at) = self.place_of(now, endpoint) else { return };
+        let Some(at) = self.place_of(now, endpoint, true) else { return };
         let wall_ns = self.clocks.wall_ns(now);
         let now_ns = self.clocks.monotonic_ns(now);
         let Some(peer) = &mut self.peers[at] else { return };
@@ -334,6 +334,7 @@ impl Engine {
         peer.hello_due = false;
         let endpoint = peer.endpoint.clone();
         self.ledger.events.push_back(LinkEvent::PeerForgotten(endpoint));
+        self.admit_waiting(now);
     }
 }
 

@@ -308,6 +308,15 @@ impl Sim {
         at
     }
 
+    /// One more process with the name of a flow, in a newer life. Returns its place.
+    pub(crate) fn double(&mut self, of: usize) -> usize {
+        let name = self.id(of).to_string();
+        self.add(&name, Limits::default());
+        let at = self.nodes.len() - 1;
+        self.crash(at);
+        at
+    }
+
     /// Lets a flow and all others discover one another.
     pub(crate) fn announce(&mut self, at: usize) {
         let endpoint = self.endpoint(at);

@@ -7,6 +7,7 @@ use blaze_domain::{FlowId, TopicName};
 
 use super::Group;
 use super::survey::{Survey, carries};
+use crate::registry::requesters;
 use crate::world::{Advertise, FlowView, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
 
 /// Most services that one merged entry lists.
@@ -149,6 +150,9 @@ fn add_request(merged: &mut Request, other: &Request) {
     merged.priority = merged.priority.zip(other.priority).map(|(a, b)| a.min(b));
     keep_same(&mut merged.type_name, &other.type_name);
     keep_same(&mut merged.type_hash, &other.type_hash);
+    let all = merged.services.iter().chain(&other.services).cloned();
+    let others = merged.more_services.saturating_add(other.more_services);
+    (merged.services, merged.more_services) = requesters(all, others);
 }
 
 /// A type or hash that both give; where they differ, none: nobody is to miss what another one's

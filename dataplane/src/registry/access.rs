@@ -89,7 +89,7 @@ impl Registry {
             return Ok(());
         };
         let (code, reason) = match fault {
-            NameFault::TooLong { .. } => {
+            NameFault::TooLong { .. } | NameFault::Kept { .. } => {
                 (ErrorCode::NameNotExpressible, LapseReason::NameNotExpressible)
             }
             NameFault::Collision { .. } => (ErrorCode::NameCollision, LapseReason::NameCollision),

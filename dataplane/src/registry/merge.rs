@@ -6,7 +6,9 @@ use blaze_domain::control::{DEFAULT_ENCODING, LeaseKind, Quality};
 use blaze_domain::{LayerName, NodeName, Priority, Scope, ServiceName};
 
 use super::leases::{LeaseView, Terms};
-use crate::world::{Advertise, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
+use crate::world::{
+    Advertise, MAX_REQUESTERS, OriginFilter, Request, ScopeEntry, Source, TopicEntry,
+};
 
 /// Most services that one entry lists.
 const MAX_SOURCES: usize = 256;
@@ -64,6 +66,7 @@ fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Opt
         Terms::Advertise { .. } => None,
     });
     let quality = merge_quality(leases.clone().map(|lease| lease.quality()))?;
+    let (services, more_services) = requesters(leases.clone().map(|lease| source(&lease)), 0);
     let mut filters = BTreeSet::new();
     let mut any_origin = false;
     for (_, _, from) in terms.clone() {
@@ -92,9 +95,18 @@ fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Opt
         from: if any_origin { Vec::new() } else { filters.into_iter().collect() },
         type_name: quality.type_name,
         type_hash: quality.type_hash,
+        services,
+        more_services,
         framed: terms.clone().any(|(_, bare, _)| !bare),
         bare: terms.into_iter().any(|(_, bare, _)| bare),
     })
+}
+
+/// The first services of all, and how many more there are beside `others`, which are not named.
+pub(crate) fn requesters(all: impl Iterator<Item = Source>, others: u32) -> (Vec<Source>, u32) {
+    let all: BTreeSet<Source> = all.collect();
+    let more = u32::try_from(all.len().saturating_sub(MAX_REQUESTERS)).unwrap_or(u32::MAX);
+    (all.into_iter().take(MAX_REQUESTERS).collect(), others.saturating_add(more))
 }
 
 /// The highest limit; `None` where one of them sets none.

@@ -43,6 +43,7 @@ use announce::{Announcer, MAX_LEASED_ENTRIES};
 use leases::LeaseTable;
 pub use leases::{LapseReason, LapsedLease, LeaseKey, LeaseView, Terms};
 pub use loads::{Load, REST};
+pub(crate) use merge::requesters;
 use names::NameBook;
 pub use names::{LayerNames, NameFault, peers_channel};
 pub use parts::LEGACY;
@@ -127,7 +128,7 @@ impl Registry {
                 config.max_leases.min(MAX_LEASED_ENTRIES),
                 config.lease_stores.clone(),
             ),
-            names: NameBook::new(config.layer_names),
+            names: NameBook::new(config.layer_names.clone()),
             on_layer: BTreeSet::new(),
             off: BTreeSet::new(),
             routes: BTreeMap::new(),

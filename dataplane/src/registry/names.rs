@@ -16,15 +16,16 @@ const FIRST_SWEEP: usize = 1024;
 const MAX_FOREIGN: usize = 10_000;
 
 /// How the layer broker names topics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum LayerNames {
     /// As they are.
     #[default]
     Any,
-    /// Kafka: `/` becomes `.`, and two names that differ only in `.` and `_` collide.
+    /// Kafka: `/` becomes `.`, two names that differ only in `.` and `_` collide, and those that
+    /// begin with `__` are its own.
     Kafka {
-        /// Length of what stands before every name, in bytes.
-        prefix_bytes: usize,
+        /// What stands before every name.
+        prefix: String,
     },
 }
 
@@ -39,6 +40,12 @@ pub enum NameFault {
         /// Bytes that it would have.
         bytes: usize,
     },
+    /// The broker keeps such names for itself.
+    #[error("would be {name} on Kafka, which keeps names that begin with __ for itself")]
+    Kept {
+        /// The name that it would have.
+        name: String,
+    },
     /// Another one has this name there.
     #[error("is one name with {other} on Kafka, where . and _ are the same")]
     Collision {
@@ -52,7 +59,7 @@ impl NameFault {
     #[must_use]
     pub fn code(&self) -> WhyCode {
         match self {
-            Self::TooLong { .. } => WhyCode::NameNotExpressible,
+            Self::TooLong { .. } | Self::Kept { .. } => WhyCode::NameNotExpressible,
             Self::Collision { .. } => WhyCode::NameCollision,
         }
     }
@@ -78,12 +85,16 @@ impl NameBook {
         topic: &TopicName,
         in_use: impl Fn(&TopicName) -> bool,
     ) -> Result<(), NameFault> {
-        let LayerNames::Kafka { prefix_bytes } = self.names else {
+        let LayerNames::Kafka { prefix } = &self.names else {
             return Ok(());
         };
-        let bytes = prefix_bytes + topic.as_str().len();
+        let bytes = prefix.len() + topic.as_str().len();
         if bytes > MAX_KAFKA_NAME {
             return Err(NameFault::TooLong { bytes });
+        }
+        let name = format!("{prefix}{topic}").replace('/', ".");
+        if name.starts_with("__") {
+            return Err(NameFault::Kept { name });
         }
         if let Some(other) = self.foreign.get(topic) {
             return Err(NameFault::Collision { other: other.clone() });
@@ -153,7 +164,7 @@ mod tests {
     }
 
     fn kafka(prefix_bytes: usize) -> NameBook {
-        NameBook::new(LayerNames::Kafka { prefix_bytes })
+        NameBook::new(LayerNames::Kafka { prefix: "p".repeat(prefix_bytes) })
     }
 
     #[test]
@@ -187,6 +198,18 @@ mod tests {
         assert_eq!(fault, NameFault::TooLong { bytes: 250 });
         assert_eq!(fault.code(), WhyCode::NameNotExpressible);
         NameBook::new(LayerNames::Any).claim(&longest, |_| false).unwrap();
+    }
+
+    #[test]
+    fn names_that_kafka_keeps_for_itself_are_told() {
+        for (prefix, name) in [("", "__transaction_state"), ("", "__consumer_offsets"), ("_", "_x")]
+        {
+            let mut book = NameBook::new(LayerNames::Kafka { prefix: prefix.to_owned() });
+            let fault = book.claim(&topic(name), |_| false).unwrap_err();
+            assert_eq!(fault.code(), WhyCode::NameNotExpressible, "{prefix}{name}");
+        }
+        kafka(1).claim(&topic("__transaction_state"), |_| false).unwrap();
+        kafka(0).claim(&topic("_x/__y"), |_| false).unwrap();
     }
 
     #[test]

@@ -76,8 +76,11 @@ impl Registry {
             // to it.
             changed = self.forget(now, from);
         }
-        match self.world.flows.get(from).map(|view| view.epoch) {
-            Some(epoch) if hello.epoch < epoch => {
+        let known = self.world.flows.get(from);
+        // A newer one that does not speak any more may have been a mistake.
+        let is_over = known.is_some_and(|view| view.reach == Reach::Down);
+        match known.map(|view| view.epoch) {
+            Some(epoch) if hello.epoch < epoch && !is_over => {
                 self.faults.old_epochs += 1;
                 return BTreeSet::new();
             }

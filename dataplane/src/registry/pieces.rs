@@ -129,6 +129,13 @@ pub(super) fn pack(pieces: impl IntoIterator<Item = wire::Entry>) -> Vec<Vec<wir
 /// Hash of one whole entry. The digest of a flow is the wrapping sum over its entries, so their
 /// order does not matter.
 pub(crate) fn entry_hash(entry: &wire::Entry) -> u64 {
+    let mut entry = entry.clone();
+    let requests = [&mut entry.node_request, &mut entry.layer_request, &mut entry.outside_request];
+    for request in requests.into_iter().flatten() {
+        // For people alone: flows of earlier versions do not know who asks.
+        request.services.clear();
+        request.more_services = 0;
+    }
     text_hash(&entry.encode_to_vec())
 }
 

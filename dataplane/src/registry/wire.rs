@@ -13,9 +13,12 @@ use prost::Message;
 use super::merge::MAX_FILTERS;
 use super::pieces::MAX_PIECE_BYTES;
 use crate::link::{class_code, class_of};
-use crate::world::{Advertise, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
+use crate::world::{
+    Advertise, MAX_REQUESTERS, OriginFilter, Request, ScopeEntry, Source, TopicEntry,
+};
 
-/// Largest advertisement: with the longest topic it fits a piece.
+/// Largest advertisement, and largest request without its filters: with the longest topic each
+/// fits a piece.
 const MAX_ADVERTISE_BYTES: usize = MAX_PIECE_BYTES - 212;
 /// Most services that an announced entry lists.
 const MAX_ANNOUNCED_SOURCES: usize = 8;
@@ -92,25 +95,39 @@ fn advertise_to_wire(advertise: &Advertise) -> wire::Advertise {
 }
 
 fn request_to_wire(request: &Request) -> wire::Request {
-    wire::Request {
+    let mut message = wire::Request {
         max_rate_hz: request.max_rate_hz.unwrap_or(0.0),
         lifespan_ms: request.lifespan_ms,
         reliable: request.reliability == Reliability::Reliable,
         transient_local: request.durability == Durability::TransientLocal,
         depth: request.depth,
         priority: request.priority.map_or(0, class_code).into(),
-        from: request
-            .from
-            .iter()
-            .map(|filter| wire::From {
-                layer: filter.layer.clone().unwrap_or_default(),
-                node: filter.node.clone().unwrap_or_default(),
-                service: filter.service.clone().unwrap_or_default(),
-            })
-            .collect(),
+        from: Vec::new(),
         r#type: request.type_name.clone(),
         type_hash: request.type_hash.clone(),
+        services: Vec::new(),
+        // Set while measuring, so that setting it later does not make the message longer.
+        more_services: u32::MAX,
+    };
+    for service in request.services.iter().take(MAX_REQUESTERS) {
+        message
+            .services
+            .push(wire::Source { node: service.node.clone(), service: service.service.clone() });
+        if message.encoded_len() > MAX_ADVERTISE_BYTES {
+            message.services.pop();
+            break;
+        }
     }
+    let left_out = request.services.len() - message.services.len();
+    let left_out = u32::try_from(left_out).unwrap_or(u32::MAX);
+    message.more_services = request.more_services.saturating_add(left_out);
+    let filter = |filter: &OriginFilter| wire::From {
+        layer: filter.layer.clone().unwrap_or_default(),
+        node: filter.node.clone().unwrap_or_default(),
+        service: filter.service.clone().unwrap_or_default(),
+    };
+    message.from = request.from.iter().map(filter).collect();
+    message
 }
 
 fn trim_route(route: &wire::RouteState) -> wire::RouteState {
@@ -167,16 +184,6 @@ fn advertise_from_wire(message: &wire::Advertise) -> Result<Advertise, EntryFaul
     within(&message.encoding, MAX_ENCODING_BYTES, "the encoding")?;
     within(&message.r#type, MAX_TYPE_BYTES, "the type")?;
     within(&message.type_hash, MAX_TYPE_BYTES, "the type hash")?;
-    if message.sources.len() > MAX_ANNOUNCED_SOURCES {
-        return Err(EntryFault::TooMany("sources"));
-    }
-    let mut sources = Vec::with_capacity(message.sources.len());
-    for source in &message.sources {
-        within(&source.node, MAX_NAME, "a source's node")?;
-        within(&source.service, MAX_NAME, "a source's service")?;
-        sources.push(Source { node: source.node.clone(), service: source.service.clone() });
-    }
-    sources.sort();
     Ok(Advertise {
         rate_hz: rate_from_wire(message.rate_hz),
         max_bytes: (message.max_bytes > 0).then_some(message.max_bytes),
@@ -192,9 +199,23 @@ fn advertise_from_wire(message: &wire::Advertise) -> Result<Advertise, EntryFaul
         depth: message.depth.max(1),
         priority: class_of(message.priority),
         lifespan_ms: message.lifespan_ms,
-        sources,
+        sources: sources_from_wire(&message.sources, MAX_ANNOUNCED_SOURCES)?,
         more_sources: message.more_sources,
     })
+}
+
+fn sources_from_wire(sources: &[wire::Source], most: usize) -> Result<Vec<Source>, EntryFault> {
+    if sources.len() > most {
+        return Err(EntryFault::TooMany("services"));
+    }
+    let mut read = Vec::with_capacity(sources.len());
+    for source in sources {
+        within(&source.node, MAX_NAME, "a service's node")?;
+        within(&source.service, MAX_NAME, "a service's name")?;
+        read.push(Source { node: source.node.clone(), service: source.service.clone() });
+    }
+    read.sort();
+    Ok(read)
 }
 
 fn request_from_wire(message: &wire::Request) -> Result<Request, EntryFault> {
@@ -230,6 +251,8 @@ fn request_from_wire(message: &wire::Request) -> Result<Request, EntryFault> {
         from,
         type_name: message.r#type.clone(),
         type_hash: message.type_hash.clone(),
+        services: sources_from_wire(&message.services, MAX_REQUESTERS)?,
+        more_services: message.more_services,
         // How a scope of another flow is served is that flow's affair.
         framed: true,
         bare: false,

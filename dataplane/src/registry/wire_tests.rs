@@ -54,8 +54,9 @@ fn any_request() -> impl Strategy<Value = Request> {
         text(200),
         proptest::collection::btree_set(filter, 0..=MAX_FILTERS),
         any::<u32>(),
+        (proptest::collection::btree_set((text(63), text(63)), 0..=MAX_REQUESTERS), any::<u32>()),
     )
-        .prop_map(|(max_rate_hz, type_name, type_hash, from, lifespan_ms)| Request {
+        .prop_map(|(max_rate_hz, type_name, type_hash, from, lifespan_ms, who)| Request {
             max_rate_hz,
             lifespan_ms,
             reliability: Reliability::Reliable,
@@ -65,6 +66,8 @@ fn any_request() -> impl Strategy<Value = Request> {
             from: from.into_iter().collect(),
             type_name,
             type_hash,
+            services: who.0.into_iter().map(|(node, service)| Source { node, service }).collect(),
+            more_services: who.1,
             framed: true,
             bare: false,
         })
@@ -125,7 +128,7 @@ proptest! {
             prop_assert_eq!(entry_hash(back), entry_hash(whole));
             let (back_topic, back) = from_wire(back).unwrap();
             prop_assert_eq!(&back_topic, topic);
-            // Only sources may have been left out.
+            // Only names of services may have been left out.
             let mut expected = entry.clone();
             let scopes = [
                 (&mut expected.node, &back.node),
@@ -139,6 +142,17 @@ proptest! {
                     prop_assert!(expected.sources.starts_with(&back.sources));
                     expected.sources.clone_from(&back.sources);
                     expected.more_sources = back.more_sources;
+                }
+                if let (Some(expected), Some(back)) = (&mut expected.request, &back.request) {
+                    prop_assert!(expected.services.starts_with(&back.services));
+                    let left_out = expected.services.len() - back.services.len();
+                    let left_out = u32::try_from(left_out).unwrap();
+                    prop_assert_eq!(
+                        back.more_services,
+                        expected.more_services.saturating_add(left_out)
+                    );
+                    expected.services.clone_from(&back.services);
+                    expected.more_services = back.more_services;
                 }
             }
             prop_assert_eq!(back, expected);
@@ -174,6 +188,17 @@ fn faulty_entries_are_named() {
         fault(&|entry| entry.route_state = vec![wire::RouteState::default(); MAX_ROUTES + 1]),
         EntryFault::TooMany("route states")
     );
+}
+
+#[test]
+fn names_of_requesters_are_no_part_of_the_digest() {
+    let entry = |services: Vec<wire::Source>, more_services| wire::Entry {
+        topic: "a".into(),
+        layer_request: Some(wire::Request { services, more_services, ..wire::Request::default() }),
+        ..wire::Entry::default()
+    };
+    let named = wire::Source { node: String::new(), service: "dashboard".into() };
+    assert_eq!(entry_hash(&entry(vec![named], 7)), entry_hash(&entry(Vec::new(), 0)));
 }
 
 #[test]

@@ -10,6 +10,7 @@ use blaze_domain::{
 use serde::{Serialize, Serializer};
 
 use super::StepKind;
+use crate::link::NameConflict;
 use crate::plan::{Target, TopicPlan};
 use crate::world::World;
 
@@ -34,6 +35,8 @@ pub struct WhyInput<'a> {
     pub routes: Vec<RouteFacts>,
     /// Leases of this topic that lapsed lately or were refused, newest first.
     pub leases: Vec<LeaseHint>,
+    /// Flows whose name several programs have.
+    pub conflicts: Vec<NameConflict>,
 }
 
 /// `layer[/node[/service]]`.

@@ -105,6 +105,11 @@ pub fn explain(input: &WhyInput<'_>) -> Why {
     let verdict = verdict(&destinations, input.to.is_some());
     let mut traces: Vec<Trace> = destinations.into_iter().flatten().collect();
     traces.sort_by_key(|trace| std::cmp::Reverse(trace.verdict()));
+    if verdict != Verdict::Flowing
+        && let Some(conflict) = conflict(input, &traces)
+    {
+        traces.insert(0, conflict);
+    }
     let code = traces.first().map_or(WhyCode::NoAdvertise, Trace::code);
     let mut steps: Vec<Step> = Vec::new();
     for step in traces.into_iter().flat_map(|trace| trace.steps) {
@@ -123,6 +128,16 @@ pub fn explain(input: &WhyInput<'_>) -> Why {
         },
         steps,
     }
+}
+
+/// A flow on the way whose name another program has, too: messages may reach that one.
+fn conflict(input: &WhyInput<'_>, traces: &[Trace]) -> Option<Trace> {
+    let me = &input.world.me;
+    let steps = || traces.iter().flat_map(|trace| &trace.steps);
+    let is_on_the_way = |flow: &FlowId| flow == me || steps().any(|step| step.flow == *flow);
+    let conflict = input.conflicts.iter().find(|conflict| is_on_the_way(&conflict.flow))?;
+    let detail = conflict.detail.clone();
+    Some(Trace::failed(&conflict.flow, StepKind::Link, WhyCode::NameInUse, detail))
 }
 
 /// Whether messages are skipped because more is published than was advertised.

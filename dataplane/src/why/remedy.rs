@@ -92,6 +92,9 @@ pub(super) fn remedy(code: WhyCode) -> &'static str {
             "Give each node and each layer a broker or a `prefix` of its own: another flow uses \
              this one."
         }
+        WhyCode::NameInUse => {
+            "Stop one of the programs that the step names, or give it a `node.name` of its own."
+        }
         WhyCode::NativePath => {
             "Nothing to do: publisher and requester reach each other without a bridge."
         }

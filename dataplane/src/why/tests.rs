@@ -4,6 +4,7 @@ use blaze_domain::{DropReason, Durability, Reliability};
 use serde_json::json;
 
 use super::*;
+use crate::link::NameConflict;
 use crate::plan::tests::generate::System;
 use crate::plan::tests::worlds::{ask, entry, filter, id, offer, rules, topic, world};
 use crate::plan::{PlanRules, TopicPlan, plan_topic};
@@ -20,6 +21,7 @@ struct Setup {
     layer_broker: BrokerFacts,
     routes: Vec<RouteFacts>,
     leases: Vec<LeaseHint>,
+    conflicts: Vec<NameConflict>,
 }
 
 impl Setup {
@@ -39,6 +41,7 @@ impl Setup {
             layer_broker: broker("kafka", false),
             routes: Vec::new(),
             leases: Vec::new(),
+            conflicts: Vec::new(),
         };
         setup.replan();
         setup
@@ -113,6 +116,12 @@ impl Setup {
         });
     }
 
+    /// Another program has the name of a flow, too.
+    fn conflict(&mut self, flow: &str) {
+        let detail = format!("2 programs run under the name {flow}");
+        self.conflicts.push(NameConflict { flow: id(flow), is_refused: false, detail });
+    }
+
     fn why(&self) -> Why {
         explain(&WhyInput {
             world: &self.world,
@@ -124,6 +133,7 @@ impl Setup {
             layer_broker: Some(self.layer_broker.clone()),
             routes: self.routes.clone(),
             leases: self.leases.clone(),
+            conflicts: self.conflicts.clone(),
         })
     }
 }
@@ -258,6 +268,13 @@ fn rows() -> Vec<Row> {
         .replan(); } => Degraded QosMismatch Plan;
         "the requester is down": &["e/a node+", "c/b down node-"],
         |_| {} => NotFlowing PeerDown Link;
+        "another program has the requester's name": &["e/a node+", "c/b down node-"],
+        |s| s.conflict("c/b") => NotFlowing NameInUse Link;
+        "another program has the name of this flow": &["e/a node+"],
+        |s| s.conflict("e/a") => NotFlowing NameInUse Link;
+        "another program has a name, and it flows": PAIR, |s| s.conflict("c/b") => Flowing Ok;
+        "another program has the name of a third": &["e/a node+", "c/b down node-", "x/y"],
+        |s| s.conflict("x/y") => NotFlowing PeerDown Link;
         "a lost flow's word of a layer where others live": &[
             "e/a node+",
             "c/b@1",
@@ -504,7 +521,7 @@ fn the_answer_has_the_keys_of_the_contract_in_their_order() {
         r#"{"topic":"imu/data","to":"c/b","verdict":"not_flowing","code":"bridge_failed","remedy":"Read the step's "#,
         r#"detail: the broker refused what the bridge needs; it is tried again every 5 s.","steps":["#,
         r#"{"flow":"e/a","step":"advertise","ok":true,"code":"ok","detail":"driver on node scope"},"#,
-        r#"{"flow":"c/b","step":"request","ok":true,"code":"ok","detail":"on node scope"},"#,
+        r#"{"flow":"c/b","step":"request","ok":true,"code":"ok","detail":"dashboard on node scope"},"#,
         r#"{"flow":"e/a","step":"plan","ok":true,"code":"ok","detail":"they match"},"#,
         r#"{"flow":"e/a","step":"bridge","ok":false,"code":"bridge_failed","detail":"node to inter, c/b: topic refused"}]}"#,
     );

@@ -497,5 +497,13 @@ fn advertised(publisher: &Publisher<'_>) -> String {
 }
 
 fn requested(requester: &Requester<'_>) -> String {
-    format!("on {} scope", requester.scope)
+    let request = requester.request;
+    let mut services: Vec<&str> =
+        request.services.iter().map(|service| service.service.as_str()).collect();
+    services.dedup();
+    let more = match request.more_services {
+        0 => String::new(),
+        more => format!(" and {more} more"),
+    };
+    format!("{}{more} on {} scope", services.join(", "), requester.scope).trim_start().to_owned()
 }

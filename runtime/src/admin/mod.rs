@@ -101,9 +101,14 @@ pub struct AdminServer {
     counters: Arc<Counters>,
 }
 
+/// Says on stderr where a program is asked, before it is ready: `admin listening on ADDRESS`.
+pub fn say_listening(address: SocketAddr) {
+    say(format_args!("admin listening on {address}"));
+}
+
 impl AdminServer {
-    /// Binds the port (0: any) and says so on stderr: `admin listening on ADDRESS`. `extra` holds
-    /// the program's own routes; unknown paths and methods are answered for all.
+    /// Binds the port (0: any); the program [says so](say_listening). `extra` holds the program's own
+    /// routes; unknown paths and methods are answered for all.
     ///
     /// # Errors
     /// If the address cannot be bound.
@@ -132,7 +137,6 @@ impl AdminServer {
         };
         let listener = TcpListener::bind(address).await.map_err(describe)?;
         let address = listener.local_addr().map_err(describe)?;
-        say(format_args!("admin listening on {address}"));
         let counters = Arc::new(Counters::default());
         let router =
             routes::router(extra, readiness, metrics, Arc::clone(&counters), limits.body_bytes);

@@ -40,6 +40,29 @@ fn a_sign_of_life_that_says_nothing_new_is_no_reason_to_work() {
 }
 
 #[test]
+fn a_program_with_the_own_name_is_named() {
+    let mut bench = Bench::inside();
+    let me = bench.core.config.me.clone();
+    let own = bench.core.config.epoch;
+    let mut hear = |began: u64, after_ms: u64| {
+        let now = bench.now + Duration::from_millis(after_ms);
+        let message = LinkControl {
+            body: Some(Body::Hello(said_by(&me, Kind::Fog))),
+            channel: Some(Channel { from: me.to_string(), epoch: began, began, to: String::new() }),
+        };
+        bench.core.replica_message(now, Some(message), None);
+        bench.core.namesake(now).map(|conflict| conflict.is_refused)
+    };
+    assert_eq!(hear(own, 0), None, "that is this program");
+    // An older one: its last words may come late.
+    assert_eq!(hear(own - 1, 100), None);
+    assert_eq!(hear(own - 1, 2_599), None);
+    assert_eq!(hear(own - 1, 2_600), Some(false));
+    assert_eq!(hear(own, 5_200), None, "it is silent");
+    assert_eq!(hear(own + 1, 5_300), Some(true));
+}
+
+#[test]
 fn what_cannot_be_read_is_counted_and_does_no_harm() {
     let mut bench = Bench::inside();
     for payload in [&b"\xff\xff\xff"[..], b"{}", &[0; 100_000]] {

@@ -17,6 +17,7 @@ use blaze_brokers::dds::{
 use blaze_domain::Priority;
 
 use super::{CLASSES, MAX_HEARD, Shared, TOPIC_PREFIX, parse_topic, profile, topic};
+use crate::link::namesakes::Life;
 use crate::link::transport::{Endpoint, TransportEvent};
 
 const TICK: Duration = Duration::from_millis(200);
@@ -121,6 +122,7 @@ impl Lifecycle {
         self.dropped_before = self.shared.status.lock().dropped_by_kernel;
         self.lay_aside();
         self.shared.homes.lock().clear();
+        self.shared.namesakes.lock().clear();
         self.shared.heard.lock().clear();
         {
             let mut status = self.shared.status.lock();
@@ -150,6 +152,7 @@ impl Lifecycle {
         }
         match Generation::start(&self.shared, &self.local) {
             Ok(generation) => {
+                self.shared.own.lock().endpoint = self.local.clone();
                 self.shared.relay.set_participant(generation.participant.prefix());
                 tracing::info!(
                     flow = %self.local,
@@ -329,11 +332,20 @@ fn note_heard(shared: &Shared, writer: GuidPrefix) {
     heard.insert(writer, now);
 }
 
-/// What is known of an endpoint: its participant and which of its classes have a reader.
-type Known = BTreeMap<Endpoint, (GuidPrefix, [bool; CLASSES])>;
+/// What is known of an endpoint.
+struct Found {
+    participant: GuidPrefix,
+    /// Which of its classes have a reader.
+    classes: [bool; CLASSES],
+    /// Since when.
+    since: Instant,
+}
+
+type Known = BTreeMap<Endpoint, Found>;
 
 /// Compares all remote readers with those known before and tells the differences.
 fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[FoundReader]) {
+    let now = Instant::now();
     let mut homes: HashMap<GuidPrefix, Vec<Ipv4Addr>> = HashMap::new();
     let mut found = Known::new();
     for reader in readers {
@@ -348,15 +360,19 @@ fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[F
                 addresses.push(address);
             }
         }
-        // Another participant with this flow's name is a mistake of the operator; the engine tells
-        // it from Hello.
         if endpoint != *own {
-            let entry = found.entry(endpoint).or_insert((reader.participant, [false; CLASSES]));
-            entry.1[class as usize] = true;
+            let since = known.get(&endpoint).map_or(now, |known| known.since);
+            let entry = found.entry(endpoint).or_insert(Found {
+                participant: reader.participant,
+                classes: [false; CLASSES],
+                since,
+            });
+            entry.classes[class as usize] = true;
         }
     }
     // A datagram needs all three topics, so an endpoint counts when it is complete.
-    found.retain(|_, (_, classes)| *classes == [true; CLASSES]);
+    found.retain(|_, found| found.classes == [true; CLASSES]);
+    *shared.namesakes.lock() = namesakes(own, &found, &homes);
     *shared.homes.lock() = homes;
     shared.status.lock().endpoints = found.len();
     for endpoint in known.keys().filter(|endpoint| !found.contains_key(*endpoint)) {
@@ -366,4 +382,21 @@ fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[F
         (shared.config.sink)(TransportEvent::Discovered(endpoint.clone()));
     }
     *known = found;
+}
+
+/// Programs that have the name of this flow, or one name together.
+fn namesakes(
+    own: &Endpoint,
+    found: &Known,
+    homes: &HashMap<GuidPrefix, Vec<Ipv4Addr>>,
+) -> Vec<Life> {
+    let all: Vec<(&Endpoint, &Found)> = found.iter().collect();
+    let of_one_name = all.chunk_by(|(one, _), (other, _)| one.flow == other.flow);
+    let doubtful = of_one_name.filter(|lives| lives.len() > 1 || lives[0].0.flow == own.flow);
+    let life = |(endpoint, found): &(&Endpoint, &Found)| Life {
+        endpoint: (*endpoint).clone(),
+        addresses: homes.get(&found.participant).cloned().unwrap_or_default(),
+        since: found.since,
+    };
+    doubtful.flatten().map(life).collect()
 }

@@ -190,6 +190,25 @@ fn a_restarted_flow_is_found_with_its_new_epoch() {
 }
 
 #[test]
+fn a_flow_whose_name_a_newer_program_has_says_so() {
+    let domain = free_domain();
+    let older = start(domain, "edge/robot-1", 1);
+    let newer = start(domain, "edge/robot-1", 2);
+    let conflict = wait_for("conflict", DISCOVERY, || older.transport.name_conflicts().pop());
+    assert!(
+        conflict.is_refused && conflict.detail.contains("at 127.0.0.1, epoch 2"),
+        "{conflict:?}"
+    );
+    newer.wait_discovered(&older.endpoint, DISCOVERY);
+    let found = newer.transport.name_conflicts();
+    assert!(found.is_empty(), "it may be what is left of the life before: {found:?}");
+    drop(newer);
+    wait_for("end of the conflict", Duration::from_secs(4), || {
+        older.transport.name_conflicts().is_empty().then_some(())
+    });
+}
+
+#[test]
 fn four_flows_of_one_host_all_meet() {
     let domain = free_domain();
     let flows: Vec<Flow> = (1..=4).map(|n| start(domain, &format!("edge/robot-{n}"), 1)).collect();

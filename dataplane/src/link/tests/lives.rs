@@ -195,6 +195,58 @@ fn a_new_life_replaces_the_old_one_and_an_older_one_is_ignored() {
 }
 
 #[test]
+fn a_flow_is_a_peer_again_when_another_of_its_name_has_ended() {
+    // Before and after the first one has forgotten those who do not speak with it any more; with a
+    // Goodbye, and without.
+    for (both_ms, says_goodbye) in [(6_000, true), (120_000, true), (6_000, false)] {
+        let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b"]);
+        sim.run_ms(1_000);
+        let double = sim.double(0);
+        sim.run_ms(both_ms);
+        let up = |sim: &Sim| {
+            let peers = sim.nodes[1].engine.peers().into_iter();
+            let up = peers.filter(|peer| peer.state == PeerState::Up).map(|peer| peer.epoch);
+            up.collect::<Vec<_>>()
+        };
+        assert_eq!(up(&sim), [2], "the newer one");
+        assert_eq!(sim.nodes[1].engine.waiting_peers(), 0, "that is no lack of places");
+        if says_goodbye {
+            sim.nodes[double].engine.goodbye();
+            sim.run_ms(20);
+        }
+        sim.nodes[double].alive = false;
+        sim.run_ms(if says_goodbye { 1_000 } else { 4_000 });
+        assert_eq!(up(&sim), [1], "{both_ms}, {says_goodbye}");
+        sim.publish(1, 0, Post::reliable(1)).unwrap();
+        sim.run_ms(100);
+        assert_eq!(sim.sequences(0, 1), [1], "{both_ms}, {says_goodbye}");
+        // It came after all: a late Hello of the life that has ended.
+        let late = sim.endpoint(double);
+        if says_goodbye {
+            assert!(!sim.nodes[1].engine.peer_discovered(sim.now, late));
+            sim.run_ms(1_000);
+            assert_eq!(up(&sim), [1]);
+        }
+    }
+}
+
+#[test]
+fn a_flow_that_is_silent_for_a_while_keeps_its_place_from_its_life_before() {
+    let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b"]);
+    sim.run_ms(1_000);
+    sim.crash(1);
+    sim.run_ms(1_000);
+    let (edge, fog) = (sim.id(0), sim.id(1));
+    sim.network.set_partition(&edge, &fog, true);
+    sim.run_ms(4_000);
+    sim.network.set_partition(&edge, &fog, false);
+    sim.run_ms(1_000);
+    let expected =
+        ["up fog/b 1", "down fog/b NewEpoch", "up fog/b 2", "down fog/b Silent", "up fog/b 2"];
+    assert_eq!(names(&sim, 0), expected);
+}
+
+#[test]
 fn one_that_never_answers_is_forgotten() {
     let mut sim = Sim::new(1, Weather::delay(10), &["edge/a"]);
     let ghost = |name: &str| Endpoint { flow: name.parse().unwrap(), epoch: 4 };

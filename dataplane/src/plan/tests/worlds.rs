@@ -49,6 +49,8 @@ pub(crate) fn request() -> Request {
         from: Vec::new(),
         type_name: String::new(),
         type_hash: String::new(),
+        services: vec![Source { node: String::new(), service: "dashboard".to_owned() }],
+        more_services: 0,
         framed: true,
         bare: false,
     }

@@ -208,7 +208,7 @@ fn leases_are_bounded() {
 
 #[test]
 fn what_is_refused_is_remembered_until_it_is_granted() {
-    let layer_names = LayerNames::Kafka { prefix_bytes: 50 };
+    let layer_names = LayerNames::Kafka { prefix: "p".repeat(50) };
     let mut desk = Desk::with(|config| RegistryConfig { layer_names, ..config });
     let mut elsewhere =
         json!({"op": "request", "topic": "imu/data", "service": "a", "layer": "fog"});

@@ -149,6 +149,31 @@ fn after_a_crash_best_effort_topics_begin_at_the_end_and_old_places_are_forgotte
 }
 
 #[test]
+fn an_older_life_is_heard_again_when_the_newer_one_has_ended() {
+    for says_goodbye in [true, false] {
+        let mut pair = Pair::new(0);
+        pair.run(1000 * MS);
+        let name = pair.names()[0].clone();
+        // Another program under its name, as a failed update starts.
+        let double = Registry::new(config("cloud/a", 9, pair.now));
+        let said = Hello { state: State::Ready.into(), ..hello(&double) };
+        pair.flows[1].on_layer_hello(pair.now, &name, &said, 9, None);
+        assert_eq!(pair.sees(1).epoch, 9);
+        pair.hello(0);
+        assert_eq!((pair.sees(1).epoch, pair.flows[1].faults().old_epochs), (9, 1));
+        if says_goodbye {
+            let body = Body::Goodbye(Goodbye { epoch: 9 });
+            pair.flows[1].on_layer_control(pair.now, &name, 9, body);
+        } else {
+            let silent = pair.now + SILENT;
+            pair.flows[1].watch_flows(silent);
+        }
+        pair.hello(0);
+        assert_eq!((pair.sees(1).epoch, pair.sees(1).reach), (1, Reach::Up), "{says_goodbye}");
+    }
+}
+
+#[test]
 fn what_is_handed_over_outlives_the_good_bye() {
     let mut pair = Pair::new(0);
     pair.carries(0, &Carrying::Carries);

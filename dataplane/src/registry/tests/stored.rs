@@ -231,7 +231,7 @@ fn nothing_lapses_while_nobody_can_renew() {
 fn a_topic_that_kafka_cannot_tell_from_another_is_refused() {
     let now = Instant::now();
     let mut registry = Registry::new(RegistryConfig {
-        layer_names: LayerNames::Kafka { prefix_bytes: 60 },
+        layer_names: LayerNames::Kafka { prefix: "p".repeat(60) },
         ..config("fog/fog-1", 1, now)
     });
     // The code and the place of a refusal; empty where there is none.
