@@ -259,9 +259,15 @@ impl<C> Outbox<C> {
         Lane { outbox: Arc::clone(self), id, counts, longest_wait }
     }
 
-    /// Waits until something may be there. Cancelling it loses nothing.
+    /// Waits until there is a lane that held nothing when it was last looked at. Who leaves
+    /// something in a lane knows himself when to come back. Cancelling it loses nothing.
     pub(crate) async fn filled(&self) {
         self.filled.notified().await;
+    }
+
+    /// Ends a wait for [`filled`](Self::filled): what was left in a lane may go now.
+    pub(crate) fn ring(&self) {
+        self.filled.notify_one();
     }
 
     /// Whether nothing waits.
@@ -412,14 +418,15 @@ impl<C> Lane<C> {
                 self.counts.0.lock().queue_full += 1;
                 return PublishOutcome::Taken;
             }
-            if !queue.has_turn {
-                queue.has_turn = true;
-                state.turns.push_back(self.id);
-            }
             queue.bytes += size;
             state.bytes += size;
             queue.entries.push_back(Entry { body, since, expires });
             self.counts.0.lock().queued += 1;
+            if std::mem::replace(&mut queue.has_turn, true) {
+                // Who takes knows of the lane, and comes back when there is room.
+                return PublishOutcome::Taken;
+            }
+            state.turns.push_back(self.id);
         }
         self.outbox.filled.notify_one();
         PublishOutcome::Taken

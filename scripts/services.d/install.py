@@ -1,5 +1,5 @@
 """Gets what is missing, each component in a thread of its own, and unpacks it. Nothing is installed into the system but
-iproute2, nftables and libcurl4, if they are missing and this is root."""
+iproute2, nftables, pkg-config, libssl-dev and libcurl4, if they are missing and this is root."""
 
 import os
 import shutil
@@ -89,6 +89,11 @@ def network_tools() -> str:
     packages = [package for tool, package in (("ip", "iproute2"), ("nft", "nftables")) if not shutil.which(tool)]
     system_packages(*packages)
     return " ".join(packages)
+
+
+def openssl() -> str:
+    system_packages("pkg-config", "libssl-dev")
+    return "with headers"
 
 
 def system_packages(*packages: str) -> None:
@@ -349,6 +354,7 @@ def extract(wheel: Path, programs: dict[str, Path]) -> None:
 
 COMPONENTS = {
     "network": Component(network_tools, tools=("ip", "nft")),
+    "openssl": Component(openssl, files=(Path("/usr/include/openssl/ssl.h"),), tools=("pkg-config",), after=("network",)),
     "cargo": Component(cargo_tools, files=tuple(HOME / "cargo" / "bin" / name for name in ("cargo-deny", "cargo-nextest"))),
     "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
     "valkey": Component(valkey, files=(BIN / "valkey-server",)),

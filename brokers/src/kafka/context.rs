@@ -82,3 +82,24 @@ impl ClientContext for ReadContext {
 }
 
 impl ConsumerContext for ReadContext {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What the client says of a name that the server gave of itself comes before, and tells more.
+    #[test]
+    fn why_a_broker_is_down_outlives_that_all_are() {
+        let last = LastError::default();
+        let all = KafkaError::Global(RDKafkaErrorCode::AllBrokersDown);
+        let resolve = KafkaError::Global(RDKafkaErrorCode::Resolve);
+        last.note_event(&all, "1/1 brokers are down");
+        assert!(last.get().is_some_and(|text| text.contains("1/1 brokers are down")));
+        last.note_event(&resolve, "kafka-1.internal:9092/1: Failed to resolve");
+        last.note_event(&all, "1/1 brokers are down");
+        assert!(last.get().is_some_and(|text| text.contains("kafka-1.internal:9092")));
+        last.take();
+        last.note_event(&all, "1/1 brokers are down");
+        assert!(last.get().is_some_and(|text| text.contains("brokers are down")));
+    }
+}

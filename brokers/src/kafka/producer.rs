@@ -2,22 +2,26 @@
 //! librdkafka.
 //!
 //! ```text
-//! publish ─► outbox (bounds, deadlines) ─► feeder task ─► librdkafka (≤ 1 MiB, and ≤ 2 flights of a topic) ─► server
+//! publish ─► outbox (bounds, deadlines) ─► feeding thread ─► librdkafka (≤ 1 MiB not acknowledged) ─► server
 //!                                             ▲                    │
-//!                                             └── room ── delivery callback (poll thread): settles, measures the clock
+//!                                             └── ring ── delivery callback (poll threads): settles, measures the clock
 //! ```
 //!
 //! Little is with librdkafka because from there nothing can be taken back: it has no deadline of a
-//! message's own. And what comes while two flights of its topic are under way goes as one, so that
-//! messages that come one by one and often do not each make a request.
+//! message's own. What comes while messages of its topic are not acknowledged waits and goes
+//! together, so that messages that come one by one and often do not each make a request.
+//!
+//! There are two clients. librdkafka takes what it gets as it comes: of messages that are handed
+//! over together the first few make a request, and the others wait for its answer, as with an
+//! idempotent producer only five messages of a partition are under way; until then it looks for
+//! them without a pause, which takes half a processor. Few messages go to a client that sends at
+//! once, and cannot be too many; more go to one that gathers them.
 
 mod delivery;
 mod ready;
 #[cfg(test)]
 mod tests;
 
-use std::collections::HashMap;
-use std::collections::hash_map::Entry;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -28,26 +32,25 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use rdkafka::error::KafkaError;
 use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
-use tokio::sync::{Notify, oneshot};
+use tokio::sync::oneshot;
 
 use super::inner::Shared;
 use super::settings::Lot;
-use super::topics::{Flight, Topic};
+use super::topics::{Topic, Which};
 use super::waker::ThreadWaker;
 use crate::outbox::{Fate, Lane, Outbox, OutboxLimits, Waiting};
+use crate::wake::wait;
 use delivery::{Delivery, Sent, SharedContext, WriteContext};
 use ready::Ready;
 pub(super) use ready::{Keying, Target};
 
 /// Most bytes that are with librdkafka and not acknowledged; one larger message may be.
 const WINDOW: usize = 1024 * 1024;
-/// Messages that are handed over at once.
-const BATCH: usize = 1024;
-/// With so many bytes in flight, what comes waits until less are. librdkafka sends what it has as
-/// soon as it looks, but of one partition no more while five messages are not acknowledged, and
-/// until then it looks without a pause: what it has not it need not look for, and goes in one
-/// request.
-const CROWD: usize = 64 * 1024;
+/// Messages that are handed over at once: no more than librdkafka gets while the gathering client
+/// waits, or it would look for the rest without a pause.
+const BATCH: usize = 256;
+/// How long the gathering client waits for more.
+const GATHER: Duration = Duration::from_micros(500);
 /// How long the poll thread is with the client while something is in flight: closing waits for
 /// that. The client library ends each such visit with up to a millisecond of busy waiting.
 const POLL: Duration = Duration::from_millis(200);
@@ -72,45 +75,67 @@ const LIMITS: OutboxLimits = OutboxLimits {
 
 type Client = BaseProducer<SharedContext>;
 
-/// One client that writes, and what waits for it.
+struct Clients {
+    prompt: Client,
+    gathering: Client,
+}
+
+impl Clients {
+    fn get(&self, which: Which) -> &Client {
+        match which {
+            Which::Prompt => &self.prompt,
+            Which::Gathering => &self.gathering,
+        }
+    }
+}
+
+/// Two clients that write, and what waits for them.
 pub(super) struct Producer {
     lot: Lot,
     outbox: Arc<Outbox<Target>>,
-    client: Mutex<Option<Arc<Client>>>,
+    clients: Mutex<Option<Arc<Clients>>>,
     context: Arc<WriteContext>,
     /// Messages are between the outbox and the client.
     handing_over: AtomicBool,
 }
 
 impl Producer {
-    /// Makes the client, its task and its thread.
+    /// Makes the clients and the threads.
     pub(super) fn start(lot: Lot, shared: &Arc<Shared>) -> Result<Arc<Self>, String> {
         let producer = Arc::new(Self::new(lot, shared)?);
-        let (polled, fed) = (Arc::clone(&producer), Arc::clone(&producer));
-        let supervisor = &shared.supervisor;
-        supervisor
-            .spawn_thread(lot.as_str(), TaskPolicy::MayEnd, move || polled.poll())
-            .map_err(|error| error.to_string())?;
-        supervisor.spawn(lot.as_str(), TaskPolicy::MayEnd, async move { fed.feed().await });
+        let run = |work: fn(&Self)| {
+            let producer = Arc::clone(&producer);
+            let started =
+                shared
+                    .supervisor
+                    .spawn_thread(lot.as_str(), TaskPolicy::MayEnd, move || work(&producer));
+            started.map(drop).map_err(|error| error.to_string())
+        };
+        run(Self::feed)?;
+        run(Self::poll_gathering)?;
+        run(Self::poll)?;
         Ok(producer)
     }
 
     fn new(lot: Lot, shared: &Arc<Shared>) -> Result<Self, String> {
+        let outbox = Outbox::new(LIMITS);
         let producer = Self {
             lot,
-            outbox: Outbox::new(LIMITS),
-            client: Mutex::new(None),
+            outbox: Arc::clone(&outbox),
+            clients: Mutex::new(None),
             context: Arc::new(WriteContext {
                 shared: Arc::clone(shared),
                 in_flight: AtomicUsize::new(0),
-                waker: ThreadWaker::default(),
-                room: Notify::new(),
+                outbox,
+                prompt: ThreadWaker::default(),
+                gathering: ThreadWaker::default(),
                 fatal: AtomicBool::new(false),
                 warned: Mutex::new(None),
             }),
             handing_over: AtomicBool::new(false),
         };
-        *producer.client.lock() = Some(producer.make_client().map_err(|error| error.to_string())?);
+        *producer.clients.lock() =
+            Some(producer.make_clients().map_err(|error| error.to_string())?);
         Ok(producer)
     }
 
@@ -121,10 +146,11 @@ impl Producer {
     /// Lets the client connect and get its number from the server. By itself it tries so twice a
     /// second, and each try asks a connection at random, whether that is up or not; but also with
     /// each answer that it gets.
-    fn warm_up(&self) {
-        let Some(client) = self.client.lock().clone() else {
+    fn warm_up(&self, which: Which) {
+        let Some(clients) = self.clients.lock().clone() else {
             return;
         };
+        let client = clients.get(which);
         for _ in 0..WARM_UPS {
             if self.shared().stop.is_cancelled() {
                 return;
@@ -137,22 +163,29 @@ impl Producer {
         }
     }
 
-    fn make_client(&self) -> Result<Arc<Client>, KafkaError> {
-        let context = SharedContext(Arc::clone(&self.context));
-        self.shared().settings.producer(self.lot).create_with_context(context).map(Arc::new)
+    fn make_clients(&self) -> Result<Arc<Clients>, KafkaError> {
+        let make = |gathers| {
+            let context = SharedContext(Arc::clone(&self.context));
+            self.shared().settings.producer(self.lot, gathers).create_with_context(context)
+        };
+        Ok(Arc::new(Clients { prompt: make(None)?, gathering: make(Some(GATHER))? }))
     }
 
-    /// Whether the client gets an answer of the server. Waits for it.
+    /// Whether both clients get an answer of the server. Waits for it.
     pub(super) fn is_answered(&self, topic: &str, timeout: Duration) -> bool {
-        let client = self.client.lock().clone();
-        client.is_none_or(|client| client.client().fetch_metadata(Some(topic), timeout).is_ok())
+        let Some(clients) = self.clients.lock().clone() else {
+            return true;
+        };
+        [&clients.prompt, &clients.gathering]
+            .iter()
+            .all(|client| client.client().fetch_metadata(Some(topic), timeout).is_ok())
     }
 
-    /// Lets the poll thread begin anew with a client that knows nothing. What the old one holds is
+    /// Lets the poll thread begin anew with clients that know nothing. What the old ones hold is
     /// dropped and counted.
     pub(super) fn remake(&self) {
         self.context.fatal.store(true, Ordering::Release);
-        self.context.waker.wake();
+        self.context.prompt.wake();
     }
 
     /// A queue for a publisher.
@@ -162,7 +195,7 @@ impl Producer {
 
     /// Something may have become possible.
     pub(super) fn wake(&self) {
-        self.context.room.notify_one();
+        self.outbox.ring();
     }
 
     /// Drops all that waits.
@@ -175,10 +208,12 @@ impl Producer {
         self.outbox.close();
     }
 
-    /// Lets the poll thread look whether it is over.
+    /// Lets the threads look whether it is over.
     pub(super) fn end(&self) {
         self.clear();
-        self.context.waker.wake();
+        self.outbox.ring();
+        self.context.prompt.wake();
+        self.context.gathering.wake();
     }
 
     /// Whether everything that was taken has been settled. Looked for in the order in which
@@ -189,21 +224,18 @@ impl Producer {
             && self.context.in_flight.load(Ordering::Acquire) == 0
     }
 
-    async fn feed(&self) {
-        let stop = &self.shared().stop;
+    fn feed(&self) {
         let mut taken = Vec::with_capacity(BATCH);
         let mut scratch = String::new();
-        // Made once: one that begins anew with each message would never end where there are many.
-        let mut expiry = tokio::time::interval(EXPIRY);
-        expiry.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        while !stop.is_cancelled() {
+        let mut looked = Instant::now();
+        while !self.shared().stop.is_cancelled() {
             self.hand_over(&mut taken, &mut scratch);
             let waits = !self.outbox.is_empty();
-            tokio::select! {
-                () = stop.cancelled() => break,
-                () = self.outbox.filled() => {}
-                () = self.context.room.notified() => {}
-                _ = expiry.tick(), if waits => self.outbox.expire(Instant::now()),
+            wait(self.outbox.filled(), if waits { EXPIRY } else { IDLE });
+            let now = Instant::now();
+            if now.saturating_duration_since(looked) >= EXPIRY {
+                looked = now;
+                self.outbox.expire(now);
             }
         }
         self.clear();
@@ -221,30 +253,26 @@ impl Producer {
     fn hand_over_what_fits(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
         while self.shared().gate.is_open() {
             let in_flight = self.context.in_flight.load(Ordering::Acquire);
-            if in_flight >= CROWD {
+            if in_flight >= WINDOW {
                 return;
             }
-            let Some(client) = self.client.lock().clone() else {
+            let Some(clients) = self.clients.lock().clone() else {
                 return;
             };
             // Topics with small batches have one turn in each take: what of them is handed over
             // goes together.
             let mut limited: Vec<Arc<str>> = Vec::new();
-            let mut flights: HashMap<*const Topic, Arc<Flight>> = HashMap::new();
             let now = Instant::now();
             let allowance = |to: &Target| {
                 let topic = &to.topic;
                 let open =
                     topic.partitions().is_some() && self.shared().gate.lets(topic.stays_open);
-                let allowed = topic.allowance().filter(|_| open)?;
+                let allowed = topic.allowance(now).filter(|_| open)?;
                 if allowed != usize::MAX {
                     if limited.contains(&topic.name) {
                         return None;
                     }
                     limited.push(Arc::clone(&topic.name));
-                }
-                if let Entry::Vacant(none) = flights.entry(Arc::as_ptr(topic)) {
-                    none.insert(topic.depart(now)?);
                 }
                 Some(allowed)
             };
@@ -253,13 +281,12 @@ impl Producer {
             if taken.is_empty() {
                 return;
             }
-            // All at once, as librdkafka begins to send what it has with the first.
-            let ready = taken.drain(..).map(|waiting| {
-                let flight = flights.get(&Arc::as_ptr(&waiting.to.topic)).cloned();
-                Ready::new(waiting, flight, scratch)
-            });
-            let ready: Vec<Ready> = ready.collect();
-            drop(flights);
+            taken.iter().for_each(|waiting| waiting.to.topic.announce());
+            // All at once, as librdkafka begins to look at what it has with the first.
+            let ready: Vec<Ready> =
+                taken.drain(..).map(|waiting| Ready::new(waiting, scratch)).collect();
+            let begin = Instant::now();
+            let mut gathers = false;
             for ready in ready {
                 let topic = Arc::clone(&ready.delivery.topic);
                 let mut record = BaseRecord::with_opaque_to(&topic.name, ready.delivery)
@@ -267,7 +294,18 @@ impl Producer {
                 record.key = ready.key.as_deref();
                 record.partition = ready.partition;
                 record.headers = ready.headers;
-                self.send(&client, record);
+                let which = record.delivery_opaque.which;
+                gathers |= which == Which::Gathering;
+                self.send(clients.get(which), record);
+            }
+            self.context.prompt.wake();
+            if gathers {
+                self.context.gathering.wake();
+                // By itself it would look a millisecond later. What comes meanwhile goes with the
+                // next.
+                std::thread::sleep(GATHER.saturating_sub(begin.elapsed()));
+                // No wait: it only wakes the client.
+                let _ = clients.gathering.flush(Duration::ZERO);
             }
         }
     }
@@ -288,7 +326,7 @@ impl Producer {
         value: Option<&Bytes>,
         done: oneshot::Sender<Fate>,
     ) {
-        let Some(client) = self.client.lock().clone() else {
+        let Some(clients) = self.clients.lock().clone() else {
             return;
         };
         let delivery = Box::new(Delivery {
@@ -296,28 +334,46 @@ impl Producer {
             topic: Arc::clone(topic),
             bytes: key.len() + value.map_or(0, Bytes::len) + 1,
             sent: Instant::now(),
-            flight: None,
+            which: Which::Prompt,
         });
         let mut record = BaseRecord::with_opaque_to(&topic.name, delivery).key(key);
         record.partition = partition;
         record.payload = value.map(|value| &value[..]);
-        self.send(&client, record);
+        self.send(&clients.prompt, record);
+        self.context.prompt.wake();
     }
 
-    /// Runs the callbacks until the end, and makes the client anew after a fatal error.
+    /// Runs the callbacks of the gathering client until the end.
+    fn poll_gathering(&self) {
+        self.warm_up(Which::Gathering);
+        while !self.shared().stop.is_cancelled() {
+            let clients = self.clients.lock().clone();
+            match clients {
+                Some(clients) if clients.gathering.in_flight_count() > 0 => {
+                    clients.gathering.poll(POLL);
+                }
+                _ => self.context.gathering.wait(IDLE),
+            }
+        }
+    }
+
+    /// Runs the callbacks until the end, and makes the clients anew after a fatal error.
     fn poll(&self) {
         let stop = &self.shared().stop;
-        self.warm_up();
+        self.warm_up(Which::Prompt);
         while !stop.is_cancelled() {
-            let client = self.client.lock().clone();
-            if let Some(client) = &client {
-                if self.context.in_flight.load(Ordering::Acquire) > 0 {
-                    client.poll(POLL);
+            let clients = self.clients.lock().clone();
+            if let Some(clients) = &clients {
+                if clients.prompt.in_flight_count() > 0 {
+                    clients.prompt.poll(POLL);
                 } else {
-                    self.context.waker.wait(IDLE);
-                    client.poll(Duration::ZERO);
+                    self.context.prompt.wait(IDLE);
+                    // Also errors of both.
+                    clients.prompt.poll(Duration::ZERO);
+                    clients.gathering.poll(Duration::ZERO);
                 }
-                let fatal = client.client().fatal_error();
+                let fatal = clients.prompt.client().fatal_error();
+                let fatal = fatal.or_else(|| clients.gathering.client().fatal_error());
                 if fatal.is_none() && !self.context.fatal.load(Ordering::Acquire) {
                     continue;
                 }
@@ -332,11 +388,11 @@ impl Producer {
                 );
             }
             self.context.fatal.store(false, Ordering::Release);
-            // What the old client held fails as it is dropped, and is not sent again.
-            *self.client.lock() = None;
-            drop(client);
-            match self.make_client() {
-                Ok(client) => *self.client.lock() = Some(client),
+            // What the old clients held fails as they are dropped, and is not sent again.
+            *self.clients.lock() = None;
+            drop(clients);
+            match self.make_clients() {
+                Ok(clients) => *self.clients.lock() = Some(clients),
                 Err(error) => {
                     self.shared().last_error.note(error.to_string());
                     std::thread::sleep(REMAKE);
@@ -344,7 +400,7 @@ impl Producer {
             }
             self.wake();
         }
-        let client = self.client.lock().take();
-        drop(client);
+        let clients = self.clients.lock().take();
+        drop(clients);
     }
 }

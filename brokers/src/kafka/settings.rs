@@ -5,6 +5,8 @@ use std::time::Duration;
 use blaze_domain::node_file::KafkaBroker as Section;
 use rdkafka::ClientConfig;
 use rdkafka::config::RDKafkaLogLevel;
+use rdkafka::error::KafkaError;
+use rdkafka::producer::BaseProducer;
 
 use crate::open::OpenError;
 
@@ -19,6 +21,9 @@ const FETCH_WAIT_MS: &str = "50";
 const DEBUG: &str = "topic";
 /// A consumer needs a group, though it never joins one.
 const GROUP: &str = "blaze";
+
+/// What properties of accounts and of TLS begin with.
+const ACCOUNT_KEYS: [&str; 3] = ["sasl.", "security.", "ssl."];
 
 /// What correctness rests on, so that nobody may set it otherwise.
 const FIXED: &[&str] = &[
@@ -114,21 +119,39 @@ impl Settings {
         let settings = Self { base, given };
         // One of each kind, as each has its own rules for what goes together.
         settings.check(&settings.consumer(false), "consumers")?;
-        settings.check(&settings.producer(Lot { reliable: true, large: false }), "producers")?;
+        settings
+            .check(&settings.producer(Lot { reliable: true, large: false }, None), "producers")?;
+        if settings.given.iter().any(|(key, _)| ACCOUNT_KEYS.iter().any(|of| key.starts_with(of))) {
+            settings.check_account()?;
+        }
         Ok(settings)
     }
 
     fn check(&self, config: &ClientConfig, kind: &str) -> Result<(), OpenError> {
-        let refused = |error: rdkafka::error::KafkaError| {
-            let reason = if self.given.is_empty() {
-                error.to_string()
-            } else {
-                // The library's text may hold the value.
-                format!("the client library refuses them for {kind}")
-            };
-            OpenError::Setting { key: "kafka.properties".to_owned(), reason }
+        let refused = |error: KafkaError| {
+            self.refused(&error, &format!("the client library refuses them for {kind}"))
         };
         config.create_native_config().map(|_| ()).map_err(refused)
+    }
+
+    /// Files of certificates, and what an account needs, are looked at when a client is made. This
+    /// one connects nowhere.
+    fn check_account(&self) -> Result<(), OpenError> {
+        let mut config = self.admin();
+        config.remove("bootstrap.servers").set_log_level(RDKafkaLogLevel::Emerg);
+        let made: Result<BaseProducer, _> = config.create();
+        made.map(|_| ()).map_err(|error| self.refused(&error, "the client library refuses them"))
+    }
+
+    /// The library's text may hold a value, and that may be a secret.
+    fn refused(&self, error: &KafkaError, otherwise: &str) -> OpenError {
+        let text = error.to_string();
+        let secret = |(key, value): &(String, String)| {
+            !key.ends_with(".location") && text.contains(value.as_str())
+        };
+        let reason =
+            if self.given.iter().any(secret) { otherwise.to_owned() } else { text.clone() };
+        OpenError::Setting { key: "kafka.properties".to_owned(), reason }
     }
 
     /// Where the server is, for people.
@@ -225,12 +248,13 @@ impl Settings {
         self.with(&[], &[])
     }
 
-    /// Writes channels.
-    pub(super) fn producer(&self, lot: Lot) -> ClientConfig {
+    /// Writes channels: sends at once what it gets, or gathers it for a time.
+    pub(super) fn producer(&self, lot: Lot, gathers: Option<Duration>) -> ClientConfig {
+        let linger = gathers.map_or(0.0, |time| time.as_secs_f64() * 1_000.0).to_string();
         let timeout = lot.longest_wait().as_millis().to_string();
         self.with(
             &[
-                ("linger.ms", "0"),
+                ("linger.ms", &linger),
                 // The server's limit counts the whole batch, and a topic allows 1 MiB by default:
                 // messages that each fit must not be refused for their company.
                 ("batch.size", "500000"),
@@ -255,12 +279,6 @@ fn check_property(key: &str, value: &str) -> Result<(), OpenError> {
     };
     if FIXED.contains(&key) {
         return refuse("is set by BlazeAIoT itself");
-    }
-    if key == "security.protocol"
-        && !cfg!(feature = "kafka-tls")
-        && !value.eq_ignore_ascii_case("plaintext")
-    {
-        return Err(OpenError::NotBuilt { feature: "kafka-tls" });
     }
     let mut alone = ClientConfig::new();
     alone.set(key, value);
@@ -329,14 +347,14 @@ pub(super) mod tests {
             config.create_native_config().unwrap();
         }
         for (reliable, large) in [(false, false), (true, false), (false, true), (true, true)] {
-            settings.producer(Lot { reliable, large }).create_native_config().unwrap();
+            settings.producer(Lot { reliable, large }, None).create_native_config().unwrap();
         }
     }
 
     #[test]
     fn properties_of_the_section_count_but_not_against_correctness() {
         let settings = Settings::new(&section(r#"{"linger.ms": 3, "client.id": "me"}"#)).unwrap();
-        let config = settings.producer(Lot { reliable: false, large: false });
+        let config = settings.producer(Lot { reliable: false, large: false }, None);
         assert_eq!(config.get("linger.ms"), Some("3"));
         assert_eq!(config.get("client.id"), Some("me"));
         assert_eq!(config.get("message.timeout.ms"), Some("5000"));
@@ -365,13 +383,19 @@ pub(super) mod tests {
         }
     }
 
-    #[cfg(not(feature = "kafka-tls"))]
     #[test]
-    fn tls_must_be_built_in() {
-        for protocol in ["ssl", "SASL_SSL", "sasl_plaintext"] {
-            let error = refused(&format!(r#"{{"security.protocol": "{protocol}"}}"#));
-            assert_eq!(error, OpenError::NotBuilt { feature: "kafka-tls" });
+    fn accounts_and_tls_are_built_in() {
+        for protocol in ["plaintext", "ssl", "SASL_SSL", "sasl_plaintext"] {
+            for mechanism in ["PLAIN", "SCRAM-SHA-256", "SCRAM-SHA-512"] {
+                let properties = serde_json::json!({
+                    "security.protocol": protocol,
+                    "sasl.mechanisms": mechanism,
+                    "sasl.username": "robot",
+                    "sasl.password": "s3cret",
+                });
+                let checked = Settings::new(&section(&properties.to_string()));
+                assert_eq!(checked.err(), None, "{protocol} {mechanism}");
+            }
         }
-        assert!(Settings::new(&section(r#"{"security.protocol": "plaintext"}"#)).is_ok());
     }
 }

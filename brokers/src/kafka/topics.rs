@@ -10,13 +10,12 @@ use parking_lot::Mutex;
 /// Bytes of a batch that no batch of ours reaches: twice `batch.size`, for what a record has beside
 /// its payload.
 const ROOMY: usize = 1_000_000;
-/// Flights of a topic at a time. With one, what comes waits for its answer; with more, each carries
-/// less, and the client library, which looks without a pause while five requests are not answered,
-/// takes a processor.
-const MAX_FLIGHTS: usize = 2;
-/// A flight that takes longer holds up nothing any more: one partition of several may have no
-/// leader.
-pub(super) const LONG_FLIGHT: Duration = Duration::from_millis(100);
+/// Of several partitions one may have no leader: what is not acknowledged for longer holds up
+/// nothing any more.
+pub(super) const LONG: Duration = Duration::from_millis(100);
+/// So many messages of a topic go at once: no more than librdkafka has of a partition under way
+/// before it waits for answers.
+const FEW: usize = 4;
 /// Not known to exist.
 const ABSENT: i32 = 0;
 
@@ -30,47 +29,34 @@ pub(super) struct Topic {
     largest_batch: AtomicUsize,
     /// The server is to be asked for it, also where it was before.
     asks_limit: AtomicBool,
-    /// Messages that are with the client library and not acknowledged.
-    in_flight: AtomicUsize,
-    flights: Mutex<Flights>,
+    in_flight: Mutex<InFlight>,
     /// Written also while the scope belongs to another flow.
     pub(super) stays_open: bool,
 }
 
-/// What was handed over and not acknowledged as a whole.
+/// Messages of a topic that are with the client library and not acknowledged.
 #[derive(Debug, Default)]
-struct Flights {
+struct InFlight {
     count: usize,
+    /// When the last of them was handed over.
     last: Option<Instant>,
+    /// The client that has them.
+    with: Which,
+    /// Those that are to be handed over together next.
+    coming: usize,
 }
 
-/// Messages of one topic that were handed over together. It ends with the last of them.
-#[derive(Debug)]
-pub(super) struct Flight(Arc<Topic>);
-
-impl Drop for Flight {
-    fn drop(&mut self) {
-        let mut flights = self.0.flights.lock();
-        flights.count = flights.count.saturating_sub(1);
-    }
+/// Of the two clients of a producer one.
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Which {
+    /// It sends at once what it gets.
+    #[default]
+    Prompt,
+    /// It gathers what it gets together.
+    Gathering,
 }
 
 impl Topic {
-    /// What is handed over next goes together; `None`: what comes waits for what is under way, so
-    /// that few large requests carry many messages where many come, and none waits where few do.
-    pub(super) fn depart(self: &Arc<Self>, now: Instant) -> Option<Arc<Flight>> {
-        let mut flights = self.flights.lock();
-        let is_long =
-            flights.last.is_some_and(|last| now.saturating_duration_since(last) >= LONG_FLIGHT);
-        if flights.count >= MAX_FLIGHTS && !is_long {
-            return None;
-        }
-        flights.count += 1;
-        flights.last = Some(now);
-        drop(flights);
-        Some(Arc::new(Flight(Arc::clone(self))))
-    }
-
     /// How many partitions the server has of it; `None` = it is not known to be there, so that
     /// nothing is handed over.
     pub(super) fn partitions(&self) -> Option<i32> {
@@ -80,16 +66,25 @@ impl Topic {
 
     /// Bytes that may be handed over now, by the sizes that an outbox counts; `None` = nothing.
     ///
+    /// What comes while messages are in flight waits, and goes together: few large requests carry
+    /// many messages where many come, and none waits where few do.
+    ///
     /// The server's limit counts the whole batch that the client library makes of what it has.
     /// Where that could be too large, only what fits is handed over, and more when it is
     /// acknowledged: a message is refused for its own size alone.
-    pub(super) fn allowance(&self) -> Option<usize> {
-        if !self.is_limited() {
-            return Some(usize::MAX);
-        }
+    pub(super) fn allowance(&self, now: Instant) -> Option<usize> {
         let limit = self.largest_batch.load(Ordering::Acquire);
-        // On the wire a small message with its headers has up to twice what the outbox counts.
-        (self.in_flight.load(Ordering::Acquire) == 0).then_some(limit / 2)
+        let in_flight = self.in_flight.lock();
+        let is_long =
+            || in_flight.last.is_some_and(|last| now.saturating_duration_since(last) >= LONG);
+        let has_several = || self.partitions().is_some_and(|partitions| partitions > 1);
+        match (in_flight.count, self.is_limited()) {
+            // On the wire a small message with its headers has up to twice what the outbox counts.
+            (0, true) => Some(limit / 2),
+            (0, false) => Some(usize::MAX),
+            (_, false) if has_several() && is_long() => Some(usize::MAX),
+            _ => None,
+        }
     }
 
     /// Whether the server takes less than what batches may become.
@@ -98,13 +93,35 @@ impl Topic {
         limit != 0 && limit < ROOMY
     }
 
-    /// Messages are handed over, or no longer with the client library.
-    pub(super) fn note_in_flight(&self, begins: bool) {
-        if begins {
-            self.in_flight.fetch_add(1, Ordering::AcqRel);
-        } else {
-            self.in_flight.fetch_sub(1, Ordering::AcqRel);
+    /// A message is about to be handed over, with others.
+    pub(super) fn announce(&self) {
+        self.in_flight.lock().coming += 1;
+    }
+
+    /// The client for what was announced. As long as one has messages, all go there: the other
+    /// might be faster.
+    pub(super) fn client(&self) -> Which {
+        let mut in_flight = self.in_flight.lock();
+        if in_flight.count == 0 {
+            let few = in_flight.coming <= FEW;
+            in_flight.with = if few { Which::Prompt } else { Which::Gathering };
         }
+        in_flight.with
+    }
+
+    /// A message is handed over.
+    pub(super) fn begin(&self, now: Instant) {
+        let mut in_flight = self.in_flight.lock();
+        in_flight.count += 1;
+        in_flight.coming = in_flight.coming.saturating_sub(1);
+        in_flight.last = Some(now);
+    }
+
+    /// A message is no longer with the client library. Whether it was the last.
+    pub(super) fn end(&self) -> bool {
+        let mut in_flight = self.in_flight.lock();
+        in_flight.count = in_flight.count.saturating_sub(1);
+        in_flight.count == 0
     }
 
     /// The server refused a message for its size. Where that was thought to be impossible, messages
@@ -151,8 +168,7 @@ impl Topics {
             partitions: AtomicI32::new(ABSENT),
             largest_batch: AtomicUsize::new(0),
             asks_limit: AtomicBool::new(true),
-            in_flight: AtomicUsize::new(0),
-            flights: Mutex::default(),
+            in_flight: Mutex::default(),
             stays_open,
         });
         by_name.insert(Arc::clone(name), Arc::downgrade(&topic));
@@ -252,24 +268,26 @@ mod tests {
     fn a_topic_with_small_batches_gets_what_fits_when_nothing_is_on_its_way() {
         let topics = Topics::default();
         let (topic, _) = topics.of(&Arc::from("a"), false);
-        assert_eq!(topic.allowance(), Some(usize::MAX), "not known");
+        let now = Instant::now();
+        let allowance = || topic.allowance(now);
+        assert_eq!(allowance(), Some(usize::MAX), "not known");
         assert_eq!(topics.without_limit(&found(&[("a", 1)]), 8).len(), 1);
         topics.note_limit("a", Some(10_000));
         assert!(topics.without_limit(&found(&[("a", 1)]), 8).is_empty());
-        assert_eq!(topic.allowance(), Some(5_000));
-        topic.note_in_flight(true);
-        assert_eq!(topic.allowance(), None);
-        topic.note_in_flight(false);
-        assert_eq!(topic.allowance(), Some(5_000));
+        assert_eq!(allowance(), Some(5_000));
+        topic.begin(now);
+        assert_eq!(topic.allowance(now + LONG), None);
+        assert!(topic.end());
+        assert_eq!(allowance(), Some(5_000));
         topic.doubt_limit();
-        assert_eq!(topic.allowance(), Some(5_000), "a message was too large by itself");
+        assert_eq!(allowance(), Some(5_000), "a message was too large by itself");
         assert_eq!(topics.without_limit(&found(&[("a", 1)]), 8).len(), 1);
         topics.note_limit("a", Some(17_825_792));
-        assert_eq!(topic.allowance(), Some(usize::MAX));
+        assert_eq!(allowance(), Some(usize::MAX));
         topic.doubt_limit();
-        assert_eq!(topic.allowance(), Some(0), "one by one");
+        assert_eq!(allowance(), Some(0), "one by one");
         topics.note(&found(&[]), true);
-        assert_eq!(topic.allowance(), Some(usize::MAX), "made anew it has another");
+        assert_eq!(allowance(), Some(usize::MAX), "made anew it has another");
         topics.note_limit("a", None);
         assert!(
             topics.without_limit(&found(&[("a", 1)]), 8).is_empty(),
@@ -278,23 +296,46 @@ mod tests {
     }
 
     #[test]
-    fn two_flights_are_under_way_and_a_long_one_holds_up_nothing() {
+    fn what_is_in_flight_holds_up_the_next_unless_it_takes_long() {
         let topics = Topics::default();
         let (topic, _) = topics.of(&Arc::from("a"), false);
         let now = Instant::now();
-        let first = topic.depart(now).unwrap();
-        let second = topic.depart(now).unwrap();
-        let of_second = Arc::clone(&second);
-        assert!(topic.depart(now).is_none());
-        drop(second);
-        assert!(topic.depart(now).is_none(), "one message of it is not acknowledged");
-        drop(of_second);
-        let third = topic.depart(now).unwrap();
-        assert!(topic.depart(now + LONG_FLIGHT / 2).is_none());
-        let fourth = topic.depart(now + LONG_FLIGHT).unwrap();
-        assert!(topic.depart(now + LONG_FLIGHT).is_none());
-        drop((first, third, fourth));
-        assert!(topic.depart(now + LONG_FLIGHT).is_some());
+        assert_eq!(topic.allowance(now), Some(usize::MAX));
+        topic.begin(now);
+        topic.begin(now);
+        assert!(!topic.end());
+        assert_eq!(topic.allowance(now), None, "one is not acknowledged");
+        topics.note(&found(&[("a", 1)]), false);
+        assert_eq!(topic.allowance(now + LONG), None, "it waits for the only partition");
+        topics.note(&found(&[("a", 2)]), false);
+        assert_eq!(topic.allowance(now + LONG), Some(usize::MAX));
+        topic.begin(now + LONG);
+        assert_eq!(topic.allowance(now + LONG), None);
+        assert!(!topic.end());
+        assert!(topic.end());
+        assert_eq!(topic.allowance(now + LONG), Some(usize::MAX));
+    }
+
+    #[test]
+    fn many_go_to_the_client_that_gathers_but_past_none_that_is_on_its_way() {
+        let topics = Topics::default();
+        let (topic, _) = topics.of(&Arc::from("a"), false);
+        let now = Instant::now();
+        let hand_over = |count: usize| {
+            (0..count).for_each(|_| topic.announce());
+            let client = topic.client();
+            (0..count).for_each(|_| topic.begin(now));
+            client
+        };
+        assert_eq!(hand_over(FEW), Which::Prompt);
+        assert_eq!(hand_over(FEW + 1), Which::Prompt, "the first are on their way");
+        (0..2 * FEW).for_each(|_| assert!(!topic.end()));
+        assert!(topic.end());
+        assert_eq!(hand_over(FEW + 1), Which::Gathering);
+        assert_eq!(hand_over(1), Which::Gathering);
+        (0..=FEW).for_each(|_| assert!(!topic.end()));
+        assert!(topic.end());
+        assert_eq!(hand_over(1), Which::Prompt);
     }
 
     #[test]

@@ -36,7 +36,8 @@ pub struct KafkaOptions {
     pub heap_mib: u32,
     /// The host of a network that it runs and listens on; absent = this machine's loopback.
     pub host: Option<Host>,
-    /// Lines of `server.properties`; they win over those of `scripts/services.d/kafka.properties`.
+    /// Lines of `server.properties`; they win over those of `scripts/services.d/kafka.properties`,
+    /// and have the same words of the form `@WORD@`.
     pub extra: Vec<String>,
 }
 
@@ -88,15 +89,11 @@ impl KafkaServer {
         let data = folder.join("data");
         let cluster = new_cluster_id();
         copy_formatted(&installed::path("kafka/formatted")?, &data, &cluster)?;
-        let mut text = PROPERTIES
+        let text = format!("{PROPERTIES}\n{}\n", options.extra.join("\n"))
             .replace("PLAINTEXT://127.0.0.1:", &format!("PLAINTEXT://{}:", endpoint.ip()))
             .replace("@PORT@", &endpoint.port.to_string())
             .replace("@CONTROLLER_PORT@", &ports::free()?.to_string())
             .replace("@DATA@", &data.display().to_string());
-        for line in &options.extra {
-            text.push_str(line);
-            text.push('\n');
-        }
         std::fs::write(folder.join("server.properties"), text)?;
         std::fs::write(folder.join("log4j2.properties"), LOGGING)?;
         Ok(Self { process, options, endpoint, cluster })

@@ -1,10 +1,8 @@
 //! The thread that hands messages to DDS writers.
 
 use std::collections::{HashMap, VecDeque};
-use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::task::Context;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -21,7 +19,7 @@ use crate::dds::DdsError;
 use crate::dds::reader::StoppableThread;
 use crate::outbox::{Body, Fate, Waiting};
 use crate::port::{Content, PublisherOptions};
-use crate::wake::unpark_waker;
+use crate::wake::wait;
 
 /// Messages and bytes of one turn; one message always fits.
 const TURN_MESSAGES: usize = 64;
@@ -268,13 +266,4 @@ fn octets(waiting: &Waiting<Target>, now: Instant) -> Bytes {
     bytes.put_slice(&head);
     bytes.put_slice(frame.payload());
     bytes.freeze()
-}
-
-/// Waits in this thread, at most for a time.
-fn wait(future: impl Future<Output = ()>, longest: Duration) {
-    let waker = unpark_waker();
-    let mut future = pin!(future);
-    if future.as_mut().poll(&mut Context::from_waker(&waker)).is_pending() {
-        thread::park_timeout(longest);
-    }
 }

@@ -11,14 +11,14 @@ use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
 use rdkafka::message::{DeliveryResult, Message as _, Timestamp};
 use rdkafka::producer::{NoCustomPartitioner, ProducerContext};
-use tokio::sync::{Notify, oneshot};
+use tokio::sync::oneshot;
 
-use super::CROWD;
+use super::Target;
 use crate::kafka::context;
 use crate::kafka::inner::Shared;
-use crate::kafka::topics::{Flight, Topic};
+use crate::kafka::topics::{Topic, Which};
 use crate::kafka::waker::ThreadWaker;
-use crate::outbox::{Fate, Receipt};
+use crate::outbox::{Fate, Outbox, Receipt};
 
 /// What is lost with the client is said in the log that often at most; the counters have all.
 const WARN_EVERY: Duration = Duration::from_secs(1);
@@ -30,8 +30,8 @@ pub(in crate::kafka) struct Delivery {
     pub(in crate::kafka) bytes: usize,
     pub(in crate::kafka) sent: Instant,
     pub(in crate::kafka) receipt: Sent,
-    /// What it was handed over with; `None` for a value of a key.
-    pub(in crate::kafka) flight: Option<Arc<Flight>>,
+    /// The client that has it.
+    pub(in crate::kafka) which: Which,
 }
 
 /// The party that learns what became of a record.
@@ -46,10 +46,12 @@ pub(in crate::kafka) enum Sent {
 pub(in crate::kafka) struct WriteContext {
     /// Bytes that are with librdkafka and not acknowledged.
     pub(in crate::kafka) in_flight: AtomicUsize,
-    /// Wakes the poll thread.
-    pub(in crate::kafka) waker: ThreadWaker,
-    /// Wakes the feeder.
-    pub(in crate::kafka) room: Notify,
+    /// Wakes the poll thread of the prompt client.
+    pub(in crate::kafka) prompt: ThreadWaker,
+    /// Wakes that of the gathering client.
+    pub(in crate::kafka) gathering: ThreadWaker,
+    /// Where messages wait; its ring wakes the feeding thread.
+    pub(in crate::kafka) outbox: Arc<Outbox<Target>>,
     pub(in crate::kafka) fatal: AtomicBool,
     /// When a loss was last said in the log.
     pub(in crate::kafka) warned: Mutex<Option<Instant>>,
@@ -95,15 +97,13 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
 impl WriteContext {
     /// A record goes to the client.
     pub(in crate::kafka) fn begin(&self, delivery: &Delivery) {
-        delivery.topic.note_in_flight(true);
-        if self.in_flight.fetch_add(delivery.bytes, Ordering::AcqRel) == 0 {
-            self.waker.wake();
-        }
+        delivery.topic.begin(delivery.sent);
+        self.in_flight.fetch_add(delivery.bytes, Ordering::AcqRel);
     }
 
     /// A record is no longer with the client: it was delivered, or there is an error.
     pub(in crate::kafka) fn settle(&self, delivery: Delivery, error: Option<&KafkaError>) {
-        let Delivery { topic, bytes, receipt, flight, .. } = delivery;
+        let Delivery { topic, bytes, receipt, .. } = delivery;
         let is_message = matches!(receipt, Sent::Message(_));
         let fate = error.map_or(Fate::Delivered, |error| self.failed(error, &topic, is_message));
         match receipt {
@@ -111,12 +111,9 @@ impl WriteContext {
             // Without a receiver the broker is closed.
             Sent::Keyed(done) => drop(done.send(fate)),
         }
-        topic.note_in_flight(false);
-        let before = self.in_flight.fetch_sub(bytes, Ordering::AcqRel);
-        let after = before.saturating_sub(bytes);
-        let has_landed = flight.and_then(Arc::into_inner).is_some();
-        if has_landed || after == 0 || (before >= CROWD && after < CROWD) || topic.is_limited() {
-            self.room.notify_one();
+        self.in_flight.fetch_sub(bytes, Ordering::AcqRel);
+        if topic.end() {
+            self.outbox.ring();
         }
     }
 

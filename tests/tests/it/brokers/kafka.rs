@@ -1,5 +1,6 @@
 //! The Kafka adapter against a real broker.
 
+mod accounts;
 mod identities;
 mod offsets;
 mod outages;
