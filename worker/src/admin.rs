@@ -20,8 +20,10 @@ use crate::engine::{Counts, Status};
 use crate::running::RunningWorker;
 use crate::serve::SpeakerCounts;
 
-/// Between two looks at the worker, for readiness and metrics.
-const LOOK: Duration = Duration::from_millis(250);
+/// Between two looks at the worker, for readiness and metrics. Each reckons with all services.
+const LOOK: Duration = Duration::from_secs(1);
+/// Between two looks whether services reach it.
+const REACH: Duration = Duration::from_millis(250);
 const NOTHING: &str = "nothing is loaded yet";
 /// The same until services reach it.
 const FIRST_LOOK: Duration = Duration::from_millis(50);
@@ -104,7 +106,8 @@ impl Shown {
             let state = if is_reached { CheckStatus::Ok } else { CheckStatus::Failed };
             readiness.set(broker, state, words);
             // The answer has all services in it: not 20 times a second for nothing.
-            let is_due = is_reached || looked.is_none_or(|at: Instant| at.elapsed() >= LOOK);
+            let rest = if is_reached && !*self.begun.borrow() { FIRST_LOOK } else { LOOK };
+            let is_due = looked.is_none_or(|at: Instant| at.elapsed() >= rest);
             if is_due && let Some(status) = worker.status().await {
                 looked = Some(Instant::now());
                 tell(&readiness, &status);
@@ -115,7 +118,7 @@ impl Shown {
                 }
                 self.inner.lock().status = Some(status);
             }
-            let pause = if *self.begun.borrow() { LOOK } else { FIRST_LOOK };
+            let pause = if *self.begun.borrow() { REACH } else { FIRST_LOOK };
             tokio::time::sleep(pause).await;
         }
     }

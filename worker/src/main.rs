@@ -80,12 +80,10 @@ fn schema() -> Schema<NodeFile> {
     node_schema(|file| {
         let mut faults = WorkerSettings::of(file).err().unwrap_or_default();
         let key = Vault::load(file.worker.key_file.as_deref());
-        faults.extend(
-            key.err().map(|error| Fault {
-                path: "worker.key_file".to_owned(),
-                detail: error.to_string().trim_start_matches("worker.key_file: ").to_owned(),
-            }),
-        );
+        faults.extend(key.err().map(|error| Fault {
+            path: "worker.key_file".to_owned(),
+            detail: error.to_string().trim_start_matches("worker.key_file: ").to_owned(),
+        }));
         faults
     })
 }

@@ -30,7 +30,7 @@ const CONNECT: Duration = Duration::from_secs(1);
 /// Time for one call.
 const CALL: Duration = Duration::from_secs(2);
 /// Between two looks whether the server is still the same.
-const LOOK: Duration = Duration::from_millis(500);
+const LOOK: Duration = Duration::from_secs(1);
 /// Keys that one look at many takes from the server at a time.
 const SCAN: usize = 500;
 /// The same of values, which may be large.
