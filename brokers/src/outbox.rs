@@ -362,7 +362,12 @@ impl<C> Outbox<C> {
         let state = &mut *state;
         for queue in state.lanes.values_mut() {
             state.bytes -= queue.drop_overdue(now);
+            // What comes next is new to who takes.
+            queue.has_turn &= !queue.entries.is_empty();
         }
+        let lanes = &mut state.lanes;
+        state.turns.retain(|id| lanes.get(id).is_some_and(|queue| queue.has_turn));
+        lanes.retain(|_, queue| queue.has_turn || !queue.orphaned);
     }
 
     /// Drops all that waits.
@@ -646,5 +651,28 @@ mod tests {
         assert_eq!(lane.later(), Later { broker_error: 3, ..Later::default() });
         outbox.close();
         assert_eq!(lane.push(bare(4, 10), None), PublishOutcome::Dropped);
+    }
+
+    /// Who takes is woken by the first message of a lane, also after what it held was dropped.
+    #[test]
+    fn a_lane_that_held_nothing_rings() {
+        let rings =
+            |outbox: &Outbox<()>| futures::FutureExt::now_or_never(outbox.filled()).is_some();
+        let outbox = Outbox::new(SMALL);
+        let lane = outbox.lane((), None);
+        let soon = Instant::now() + Duration::from_secs(60);
+        lane.push(bare(1, 10), Some(soon));
+        assert!(rings(&outbox));
+        lane.push(bare(2, 10), Some(soon));
+        assert!(!rings(&outbox), "it is known");
+        outbox.expire(soon);
+        assert!(outbox.is_empty());
+        lane.push(bare(3, 10), None);
+        assert!(rings(&outbox));
+        let mut taken = Vec::new();
+        outbox.take(Instant::now(), 1, 10_000, &mut taken);
+        assert_eq!(taken.len(), 1);
+        lane.push(bare(4, 10), None);
+        assert!(rings(&outbox));
     }
 }

@@ -124,6 +124,7 @@ impl Producer {
             outbox: Arc::clone(&outbox),
             clients: Mutex::new(None),
             context: Arc::new(WriteContext {
+                lot,
                 shared: Arc::clone(shared),
                 in_flight: AtomicUsize::new(0),
                 outbox,
@@ -267,7 +268,7 @@ impl Producer {
                 let topic = &to.topic;
                 let open =
                     topic.partitions().is_some() && self.shared().gate.lets(topic.stays_open);
-                let allowed = topic.allowance(now).filter(|_| open)?;
+                let allowed = topic.allowance(self.lot, now).filter(|_| open)?;
                 if allowed != usize::MAX {
                     if limited.contains(&topic.name) {
                         return None;
@@ -281,10 +282,10 @@ impl Producer {
             if taken.is_empty() {
                 return;
             }
-            taken.iter().for_each(|waiting| waiting.to.topic.announce());
+            taken.iter().for_each(|waiting| waiting.to.topic.announce(self.lot));
             // All at once, as librdkafka begins to look at what it has with the first.
             let ready: Vec<Ready> =
-                taken.drain(..).map(|waiting| Ready::new(waiting, scratch)).collect();
+                taken.drain(..).map(|waiting| Ready::new(self.lot, waiting, scratch)).collect();
             let begin = Instant::now();
             let mut gathers = false;
             for ready in ready {
@@ -329,18 +330,21 @@ impl Producer {
         let Some(clients) = self.clients.lock().clone() else {
             return;
         };
+        topic.announce(self.lot);
+        let sent = Instant::now();
+        let which = topic.depart(self.lot, sent);
         let delivery = Box::new(Delivery {
             receipt: Sent::Keyed(done),
             topic: Arc::clone(topic),
             bytes: key.len() + value.map_or(0, Bytes::len) + 1,
-            sent: Instant::now(),
-            which: Which::Prompt,
+            sent,
+            which,
         });
         let mut record = BaseRecord::with_opaque_to(&topic.name, delivery).key(key);
         record.partition = partition;
         record.payload = value.map(|value| &value[..]);
-        self.send(&clients.prompt, record);
-        self.context.prompt.wake();
+        self.send(clients.get(which), record);
+        self.context.waker(which).wake();
     }
 
     /// Runs the callbacks of the gathering client until the end.

@@ -72,6 +72,14 @@ pub(super) struct Lot {
 }
 
 impl Lot {
+    /// How many there are.
+    pub(super) const COUNT: usize = 4;
+
+    /// Its place among them.
+    pub(super) fn index(self) -> usize {
+        usize::from(self.reliable) + 2 * usize::from(self.large)
+    }
+
     /// How long a message may wait for the server.
     pub(super) fn longest_wait(self) -> Duration {
         if self.reliable { Duration::from_secs(120) } else { Duration::from_secs(5) }

@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
 
+use super::settings::Lot;
+
 /// Bytes of a batch that no batch of ours reaches: twice `batch.size`, for what a record has beside
 /// its payload.
 const ROOMY: usize = 1_000_000;
@@ -29,12 +31,12 @@ pub(super) struct Topic {
     largest_batch: AtomicUsize,
     /// The server is to be asked for it, also where it was before.
     asks_limit: AtomicBool,
-    in_flight: Mutex<InFlight>,
+    in_flight: Mutex<[InFlight; Lot::COUNT]>,
     /// Written also while the scope belongs to another flow.
     pub(super) stays_open: bool,
 }
 
-/// Messages of a topic that are with the client library and not acknowledged.
+/// Messages of a topic that are with the clients of one producer and not acknowledged.
 #[derive(Debug, Default)]
 struct InFlight {
     count: usize,
@@ -72,9 +74,9 @@ impl Topic {
     /// The server's limit counts the whole batch that the client library makes of what it has.
     /// Where that could be too large, only what fits is handed over, and more when it is
     /// acknowledged: a message is refused for its own size alone.
-    pub(super) fn allowance(&self, now: Instant) -> Option<usize> {
+    pub(super) fn allowance(&self, lot: Lot, now: Instant) -> Option<usize> {
         let limit = self.largest_batch.load(Ordering::Acquire);
-        let in_flight = self.in_flight.lock();
+        let in_flight = &self.in_flight.lock()[lot.index()];
         let is_long =
             || in_flight.last.is_some_and(|last| now.saturating_duration_since(last) >= LONG);
         let has_several = || self.partitions().is_some_and(|partitions| partitions > 1);
@@ -94,32 +96,26 @@ impl Topic {
     }
 
     /// A message is about to be handed over, with others.
-    pub(super) fn announce(&self) {
-        self.in_flight.lock().coming += 1;
+    pub(super) fn announce(&self, lot: Lot) {
+        self.in_flight.lock()[lot.index()].coming += 1;
     }
 
-    /// The client for what was announced. As long as one has messages, all go there: the other
-    /// might be faster.
-    pub(super) fn client(&self) -> Which {
-        let mut in_flight = self.in_flight.lock();
+    /// All that was announced is in flight from now on. Returns the client for it: as long as one
+    /// has messages, all go there, as the other might be faster.
+    pub(super) fn depart(&self, lot: Lot, now: Instant) -> Which {
+        let in_flight = &mut self.in_flight.lock()[lot.index()];
         if in_flight.count == 0 {
             let few = in_flight.coming <= FEW;
             in_flight.with = if few { Which::Prompt } else { Which::Gathering };
         }
+        in_flight.count += std::mem::take(&mut in_flight.coming);
+        in_flight.last = Some(now);
         in_flight.with
     }
 
-    /// A message is handed over.
-    pub(super) fn begin(&self, now: Instant) {
-        let mut in_flight = self.in_flight.lock();
-        in_flight.count += 1;
-        in_flight.coming = in_flight.coming.saturating_sub(1);
-        in_flight.last = Some(now);
-    }
-
     /// A message is no longer with the client library. Whether it was the last.
-    pub(super) fn end(&self) -> bool {
-        let mut in_flight = self.in_flight.lock();
+    pub(super) fn end(&self, lot: Lot) -> bool {
+        let in_flight = &mut self.in_flight.lock()[lot.index()];
         in_flight.count = in_flight.count.saturating_sub(1);
         in_flight.count == 0
     }
@@ -264,20 +260,29 @@ mod tests {
         assert!(topics.of(&name, false).1, "it was forgotten with its last publisher");
     }
 
+    const LOT: Lot = Lot { reliable: true, large: false };
+
+    fn hand_over(topic: &Topic, count: usize, now: Instant) -> Which {
+        (0..count).for_each(|_| topic.announce(LOT));
+        let client = topic.depart(LOT, now);
+        assert_eq!(topic.depart(LOT, now), client, "each message of them asks");
+        client
+    }
+
     #[test]
     fn a_topic_with_small_batches_gets_what_fits_when_nothing_is_on_its_way() {
         let topics = Topics::default();
         let (topic, _) = topics.of(&Arc::from("a"), false);
         let now = Instant::now();
-        let allowance = || topic.allowance(now);
+        let allowance = || topic.allowance(LOT, now);
         assert_eq!(allowance(), Some(usize::MAX), "not known");
         assert_eq!(topics.without_limit(&found(&[("a", 1)]), 8).len(), 1);
         topics.note_limit("a", Some(10_000));
         assert!(topics.without_limit(&found(&[("a", 1)]), 8).is_empty());
         assert_eq!(allowance(), Some(5_000));
-        topic.begin(now);
-        assert_eq!(topic.allowance(now + LONG), None);
-        assert!(topic.end());
+        hand_over(&topic, 1, now);
+        assert_eq!(topic.allowance(LOT, now + LONG), None);
+        assert!(topic.end(LOT));
         assert_eq!(allowance(), Some(5_000));
         topic.doubt_limit();
         assert_eq!(allowance(), Some(5_000), "a message was too large by itself");
@@ -300,20 +305,21 @@ mod tests {
         let topics = Topics::default();
         let (topic, _) = topics.of(&Arc::from("a"), false);
         let now = Instant::now();
-        assert_eq!(topic.allowance(now), Some(usize::MAX));
-        topic.begin(now);
-        topic.begin(now);
-        assert!(!topic.end());
-        assert_eq!(topic.allowance(now), None, "one is not acknowledged");
+        assert_eq!(topic.allowance(LOT, now), Some(usize::MAX));
+        hand_over(&topic, 1, now);
+        hand_over(&topic, 1, now);
+        assert!(!topic.end(LOT));
+        assert_eq!(topic.allowance(LOT, now), None, "one is not acknowledged");
+        assert_eq!(topic.allowance(Lot::default(), now), Some(usize::MAX), "another producer's");
         topics.note(&found(&[("a", 1)]), false);
-        assert_eq!(topic.allowance(now + LONG), None, "it waits for the only partition");
+        assert_eq!(topic.allowance(LOT, now + LONG), None, "it waits for the only partition");
         topics.note(&found(&[("a", 2)]), false);
-        assert_eq!(topic.allowance(now + LONG), Some(usize::MAX));
-        topic.begin(now + LONG);
-        assert_eq!(topic.allowance(now + LONG), None);
-        assert!(!topic.end());
-        assert!(topic.end());
-        assert_eq!(topic.allowance(now + LONG), Some(usize::MAX));
+        assert_eq!(topic.allowance(LOT, now + LONG), Some(usize::MAX));
+        hand_over(&topic, 1, now + LONG);
+        assert_eq!(topic.allowance(LOT, now + LONG), None);
+        assert!(!topic.end(LOT));
+        assert!(topic.end(LOT));
+        assert_eq!(topic.allowance(LOT, now + LONG), Some(usize::MAX));
     }
 
     #[test]
@@ -321,20 +327,15 @@ mod tests {
         let topics = Topics::default();
         let (topic, _) = topics.of(&Arc::from("a"), false);
         let now = Instant::now();
-        let hand_over = |count: usize| {
-            (0..count).for_each(|_| topic.announce());
-            let client = topic.client();
-            (0..count).for_each(|_| topic.begin(now));
-            client
-        };
+        let hand_over = |count| hand_over(&topic, count, now);
         assert_eq!(hand_over(FEW), Which::Prompt);
         assert_eq!(hand_over(FEW + 1), Which::Prompt, "the first are on their way");
-        (0..2 * FEW).for_each(|_| assert!(!topic.end()));
-        assert!(topic.end());
+        (0..2 * FEW).for_each(|_| assert!(!topic.end(LOT)));
+        assert!(topic.end(LOT));
         assert_eq!(hand_over(FEW + 1), Which::Gathering);
         assert_eq!(hand_over(1), Which::Gathering);
-        (0..=FEW).for_each(|_| assert!(!topic.end()));
-        assert!(topic.end());
+        (0..=FEW).for_each(|_| assert!(!topic.end(LOT)));
+        assert!(topic.end(LOT));
         assert_eq!(hand_over(1), Which::Prompt);
     }
 

@@ -27,7 +27,7 @@ use crate::world::FlowState;
 /// How often what is due is looked for.
 const TICK: Duration = Duration::from_millis(20);
 /// The same where nothing is carried and nothing was heard for a while: each look wakes a processor.
-const CALM_TICK: Duration = Duration::from_millis(200);
+const CALM_TICK: Duration = Duration::from_millis(50);
 /// A while.
 const CALM_AFTER: Duration = Duration::from_millis(500);
 /// Between attempts to subscribe to a broker that is away.

@@ -16,6 +16,7 @@ use tokio::sync::oneshot;
 use super::Target;
 use crate::kafka::context;
 use crate::kafka::inner::Shared;
+use crate::kafka::settings::Lot;
 use crate::kafka::topics::{Topic, Which};
 use crate::kafka::waker::ThreadWaker;
 use crate::outbox::{Fate, Outbox, Receipt};
@@ -44,6 +45,8 @@ pub(in crate::kafka) enum Sent {
 
 /// What the client calls back.
 pub(in crate::kafka) struct WriteContext {
+    /// What the producer is for.
+    pub(in crate::kafka) lot: Lot,
     /// Bytes that are with librdkafka and not acknowledged.
     pub(in crate::kafka) in_flight: AtomicUsize,
     /// Wakes the poll thread of the prompt client.
@@ -95,9 +98,16 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
 }
 
 impl WriteContext {
+    /// What wakes the poll thread of a client.
+    pub(in crate::kafka) fn waker(&self, which: Which) -> &ThreadWaker {
+        match which {
+            Which::Prompt => &self.prompt,
+            Which::Gathering => &self.gathering,
+        }
+    }
+
     /// A record goes to the client.
     pub(in crate::kafka) fn begin(&self, delivery: &Delivery) {
-        delivery.topic.begin(delivery.sent);
         self.in_flight.fetch_add(delivery.bytes, Ordering::AcqRel);
     }
 
@@ -112,7 +122,7 @@ impl WriteContext {
             Sent::Keyed(done) => drop(done.send(fate)),
         }
         self.in_flight.fetch_sub(bytes, Ordering::AcqRel);
-        if topic.end() {
+        if topic.end(self.lot) {
             self.outbox.ring();
         }
     }

@@ -8,6 +8,7 @@ use rdkafka::message::OwnedHeaders;
 
 use super::delivery::{Delivery, Sent};
 use crate::kafka::record;
+use crate::kafka::settings::Lot;
 use crate::kafka::topics::Topic;
 use crate::outbox::{Body, Waiting};
 
@@ -41,7 +42,7 @@ pub(super) struct Ready {
 }
 
 impl Ready {
-    pub(super) fn new(waiting: Waiting<Target>, scratch: &mut String) -> Self {
+    pub(super) fn new(lot: Lot, waiting: Waiting<Target>, scratch: &mut String) -> Self {
         let (bytes, target, sent) = (waiting.size(), Arc::clone(&waiting.to), Instant::now());
         let (payload, key, partition, headers);
         match &waiting.body {
@@ -73,7 +74,7 @@ impl Ready {
             topic: Arc::clone(&target.topic),
             bytes,
             sent,
-            which: target.topic.client(),
+            which: target.topic.depart(lot, sent),
         });
         Self { payload, key, partition, headers, delivery }
     }
@@ -113,7 +114,7 @@ mod tests {
         outbox.take(Instant::now(), 1, 10_000, &mut taken);
         let mut waiting = taken.pop().unwrap();
         waiting.since = waiting.since.checked_sub(Duration::from_millis(300)).unwrap();
-        let headers = Ready::new(waiting, &mut String::new()).headers.unwrap();
+        let headers = Ready::new(Lot::default(), waiting, &mut String::new()).headers.unwrap();
         let age = headers.iter().find(|header| header.key == "blaze-age-us").unwrap();
         let age: u64 = String::from_utf8_lossy(age.value.unwrap()).parse().unwrap();
         assert!((305_000..60_000_000).contains(&age), "{age} µs");
