@@ -48,7 +48,7 @@ struct InFlight {
     coming: usize,
 }
 
-/// Of the two clients of a producer one.
+/// One of the two librdkafka clients that a producer has.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Which {
     /// It sends at once what it gets.

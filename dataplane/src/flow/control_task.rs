@@ -28,7 +28,7 @@ use crate::world::FlowState;
 const TICK: Duration = Duration::from_millis(20);
 /// The same where nothing is carried and nothing was heard for a while: each look wakes a processor.
 const CALM_TICK: Duration = Duration::from_millis(50);
-/// A while.
+/// How long no message to the flow and no news of the link must have come for that.
 const CALM_AFTER: Duration = Duration::from_millis(500);
 /// Between attempts to subscribe to a broker that is away.
 const RETRY: Duration = Duration::from_millis(250);
