@@ -26,10 +26,6 @@ use crate::world::FlowState;
 
 /// How often what is due is looked for.
 const TICK: Duration = Duration::from_millis(20);
-/// The same where nothing is carried and nothing was heard for a while: each look wakes a processor.
-const CALM_TICK: Duration = Duration::from_millis(50);
-/// How long no message to the flow and no news of the link must have come for that.
-const CALM_AFTER: Duration = Duration::from_millis(500);
 /// Between attempts to subscribe to a broker that is away.
 const RETRY: Duration = Duration::from_millis(250);
 /// How often it is measured what this flow carries.
@@ -67,16 +63,17 @@ impl ControlTask {
     pub(super) async fn run(mut self) {
         let mut node = ControlChannel::new(self.shared.brokers.node.clone());
         let mut layer = ControlChannel::new(self.shared.brokers.layer.clone());
+        let mut tick = tokio::time::interval(TICK);
+        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut announced = false;
-        let mut heard = Instant::now();
         let (mut of_node, mut of_layer): (Vec<Received>, Vec<Received>) = (Vec::new(), Vec::new());
         loop {
             tokio::select! {
                 () = self.leave.draining.cancelled() => break,
-                () = tokio::time::sleep(self.pause(heard)) => {}
-                () = self.shared.plane.news() => heard = Instant::now(),
-                () = node.receive(&mut of_node) => heard = Instant::now(),
-                () = layer.receive(&mut of_layer) => heard = Instant::now(),
+                _ = tick.tick() => {}
+                () = self.shared.plane.news() => {}
+                () = node.receive(&mut of_node) => {}
+                () = layer.receive(&mut of_layer) => {}
             }
             self.take_control(Scope::Node, &mut of_node);
             self.take_control(Scope::Layer, &mut of_layer);
@@ -94,20 +91,12 @@ impl ControlTask {
             }
             self.work();
         }
-        self.drain().await;
-    }
-
-    /// Until what is due is looked for again.
-    fn pause(&self, heard: Instant) -> Duration {
-        let is_calm = heard.elapsed() >= CALM_AFTER
-            && self.was_ready
-            && !self.shared.plane.read(|state| state.core.has_bridges());
-        if is_calm { CALM_TICK } else { TICK }
+        self.drain(tick).await;
     }
 
     /// Takes in nothing more, but tells others how it goes on until the flow has nothing left to
     /// do.
-    async fn drain(&mut self) {
+    async fn drain(&mut self, mut tick: tokio::time::Interval) {
         self.shared.control.lock().start_draining(Instant::now(), wall_ms());
         loop {
             self.work();
@@ -116,7 +105,7 @@ impl ControlTask {
             }
             tokio::select! {
                 () = self.leave.gone.cancelled() => break,
-                () = tokio::time::sleep(TICK) => {}
+                _ = tick.tick() => {}
                 () = self.shared.plane.news() => {}
             }
         }

@@ -140,12 +140,6 @@ impl TopicPath {
 }
 
 impl DataCore {
-    /// Whether any topic is carried anywhere.
-    #[must_use]
-    pub fn has_bridges(&self) -> bool {
-        self.topics.iter().any(|path| !path.vacant && !path.bridges.is_empty())
-    }
-
     /// Takes a sample of what every bridge carries, and tells the whole; to be called once a
     /// second.
     pub fn measure(&mut self, now: Instant, link: &dyn LaneLink) -> Loads {
