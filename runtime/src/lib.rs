@@ -13,6 +13,7 @@ pub mod logs;
 mod ready;
 pub mod state;
 pub mod supervisor;
+mod ticks;
 
 pub use admin::{AdminServer, CheckStatus, Gate, Readiness};
 pub use core_dumps::forbid_core_dumps;
@@ -21,3 +22,4 @@ pub use supervisor::{
     ShutdownPhase, ShutdownReport, ShutdownSteps, Signals, StopOnDrop, Supervisor, TaskEnd,
     TaskHandle, TaskInfo, TaskPolicy, block_on, exit_code, say,
 };
+pub use ticks::ticks;

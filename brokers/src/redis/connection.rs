@@ -11,11 +11,11 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use blaze_runtime::ticks;
 use futures::FutureExt as _;
 use futures::future::{Fuse, FusedFuture as _};
 use redis::aio::{AsyncPushSender, MultiplexedConnection, SendError};
 use redis::{AsyncConnectionConfig, PushInfo, PushKind, RedisError, RedisResult, Value};
-use tokio::time::MissedTickBehavior;
 
 use super::liveness::{LOOK, Liveness, Look, Watch};
 use super::state::{Failure, Line, LineState, State};
@@ -160,8 +160,7 @@ async fn connect(shared: &Shared, line: Line) -> Result<Session, Failure> {
 /// when a ping fails.
 async fn watch(shared: &Shared, line: Line, session: &Session) -> Failure {
     let mut watch = Watch::new(line.is_large());
-    let mut looks = tokio::time::interval(LOOK);
-    looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut looks = ticks(LOOK);
     let mut answer = std::pin::pin!(Fuse::terminated());
     loop {
         tokio::select! {

@@ -5,6 +5,7 @@ use std::convert::Infallible;
 use std::time::{Duration, Instant};
 
 use blaze_domain::WriterId;
+use blaze_runtime::ticks;
 use bytes::Bytes;
 use redis::RedisResult;
 use redis::aio::MultiplexedConnection;
@@ -30,7 +31,7 @@ pub(super) async fn serve(
     session: &Session,
 ) -> Result<Infallible, Failure> {
     subscriptions.forget_server();
-    let mut sweeps = tokio::time::interval(SWEEP);
+    let mut sweeps = ticks(SWEEP);
     let mut is_up = false;
     loop {
         let Work { subscribe, unsubscribe } = subscriptions.take_work();

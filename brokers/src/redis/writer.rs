@@ -4,6 +4,7 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use blaze_runtime::ticks;
 use futures::StreamExt as _;
 use futures::future::BoxFuture;
 use futures::stream::FuturesOrdered;
@@ -144,8 +145,8 @@ impl<'a> Writer<'a> {
         self.shared.state.set_line(self.keeper.line, LineState::Up);
         let mut answers = FuturesOrdered::<Answer>::new();
         // What the server has lost is to be written again, which rings no bell.
-        let mut looks = tokio::time::interval(LOOK);
-        let mut forgets = tokio::time::interval(FORGET_EVERY);
+        let mut looks = ticks(LOOK);
+        let mut forgets = ticks(FORGET_EVERY);
         loop {
             while self.gate.is_open() && self.has_room(answers.len(), session) {
                 let busy = self.gate.busy();

@@ -81,8 +81,8 @@ impl Namesake {
 
 impl ControlCore {
     /// Takes what another flow said on the channel of the layer broker, as [`read_replica_message`]
-    /// gives it; the server took it at `appended_ms` of its clock. Whether a topic changed by it:
-    /// nothing else is in a hurry, the next tick is soon enough.
+    /// gives it; the server took it at `appended_ms` of its clock. Whether a topic changed by it, or
+    /// it is to be answered: nothing else is in a hurry, the next tick is soon enough.
     pub fn replica_message(
         &mut self,
         now: Instant,
@@ -124,7 +124,7 @@ impl ControlCore {
         let any = !changed.is_empty();
         self.touch(now, changed);
         self.hurry(now);
-        any
+        any || self.registry.next_poll().is_some_and(|at| at <= now)
     }
 
     /// The layer broker is away: that nothing is heard says nothing of who lives.

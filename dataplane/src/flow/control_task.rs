@@ -14,6 +14,7 @@ use blaze_brokers::{
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WriterId};
 use blaze_proto::link::link_control::LayerScope;
+use blaze_runtime::ticks;
 use bytes::Bytes;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
@@ -25,7 +26,7 @@ use crate::registry::peers_channel;
 use crate::world::FlowState;
 
 /// How often what is due is looked for.
-const TICK: Duration = Duration::from_millis(20);
+const TICK: Duration = Duration::from_millis(50);
 /// Between attempts to subscribe to a broker that is away.
 const RETRY: Duration = Duration::from_millis(250);
 /// How often it is measured what this flow carries.
@@ -63,8 +64,7 @@ impl ControlTask {
     pub(super) async fn run(mut self) {
         let mut node = ControlChannel::new(self.shared.brokers.node.clone());
         let mut layer = ControlChannel::new(self.shared.brokers.layer.clone());
-        let mut tick = tokio::time::interval(TICK);
-        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut tick = ticks(TICK);
         let mut announced = false;
         let (mut of_node, mut of_layer): (Vec<Received>, Vec<Received>) = (Vec::new(), Vec::new());
         loop {

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use blaze_brokers::Health;
 use blaze_domain::Scope;
 use blaze_runtime::admin::{CheckStatus, Gate, Readiness};
+use blaze_runtime::ticks;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
@@ -48,6 +49,7 @@ pub(super) async fn watch_health(
     let mut listened = false;
     let mut marked = Instant::now();
     let mut conflicts = Vec::new();
+    let mut looks = ticks(HEALTH);
     loop {
         if marked.elapsed() >= MARK {
             marked = Instant::now();
@@ -91,7 +93,7 @@ pub(super) async fn watch_health(
         }
         tokio::select! {
             () = stop.cancelled() => return,
-            () = tokio::time::sleep(HEALTH) => {}
+            _ = looks.tick() => {}
             () = ready.notified() => listened = true,
         }
     }

@@ -18,6 +18,7 @@ use blaze_domain::FlowId;
 use blaze_domain::names::ChannelName;
 use blaze_proto::link::LinkControl;
 use blaze_proto::link::link_control::Body;
+use blaze_runtime::ticks;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -103,8 +104,7 @@ impl PeersTask {
         let mut since = Instant::now();
         let mut standing_back = false;
         let mut batch = Vec::with_capacity(BATCH);
-        let mut tick = tokio::time::interval(LOOK);
-        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut tick = ticks(LOOK);
         loop {
             if subscription.is_none() {
                 subscription =
