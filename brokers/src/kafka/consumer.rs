@@ -105,6 +105,8 @@ pub(super) struct Known {
     pub(super) is_awaited: bool,
     /// It is not read now, and may be.
     pub(super) is_idle: bool,
+    /// It was behind the server's end when it was last looked at.
+    pub(super) is_behind: bool,
 }
 
 #[derive(Default)]
@@ -425,6 +427,7 @@ impl Consumer {
             .map(|(name, topic)| Known {
                 topic: Arc::clone(name),
                 is_awaited: topic.is_awaited(),
+                is_behind: topic.is_behind(),
                 is_idle: !topic.assigned && self.shared.gate.lets(topic.source.stays_open),
             })
             .collect()

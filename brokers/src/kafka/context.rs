@@ -1,6 +1,7 @@
 //! What the clients of librdkafka call back.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use parking_lot::Mutex;
 use rdkafka::ClientContext;
@@ -12,28 +13,41 @@ use super::identity::Identities;
 
 /// The last error of any client of one broker, for people.
 #[derive(Debug, Default)]
-pub(super) struct LastError(Mutex<Option<String>>);
+pub(super) struct LastError {
+    text: Mutex<Option<String>>,
+    /// A broker has refused a password or a certificate.
+    refused: AtomicBool,
+}
 
 impl LastError {
     pub(super) fn note(&self, text: String) {
-        *self.0.lock() = Some(text);
+        *self.text.lock() = Some(text);
     }
 
     /// What a client calls back. That all brokers are down says less than why the last one is, as
     /// the name that it gave of itself and that is unknown here.
     pub(super) fn note_event(&self, error: &KafkaError, reason: &str) {
-        let mut last = self.0.lock();
-        if last.is_none() || error.rdkafka_error_code() != Some(RDKafkaErrorCode::AllBrokersDown) {
+        let code = error.rdkafka_error_code();
+        if matches!(code, Some(RDKafkaErrorCode::Authentication | RDKafkaErrorCode::SSL)) {
+            self.refused.store(true, Ordering::Relaxed);
+        }
+        let mut last = self.text.lock();
+        if last.is_none() || code != Some(RDKafkaErrorCode::AllBrokersDown) {
             *last = Some(format!("{error}: {reason}"));
         }
     }
 
     pub(super) fn get(&self) -> Option<String> {
-        self.0.lock().clone()
+        self.text.lock().clone()
+    }
+
+    /// Whether a broker has refused a password or a certificate since the last call.
+    pub(super) fn take_refused(&self) -> bool {
+        self.refused.swap(false, Ordering::Relaxed)
     }
 
     pub(super) fn take(&self) -> Option<String> {
-        self.0.lock().take()
+        self.text.lock().take()
     }
 }
 
@@ -60,16 +74,28 @@ pub(super) struct ReadContext {
     pub(super) identities: Arc<Identities>,
     /// Where errors are noted.
     pub(super) last_error: Arc<LastError>,
+    /// Lines of the log and errors so far.
+    served: AtomicUsize,
 }
 
 impl ReadContext {
     pub(super) fn new(identities: &Arc<Identities>, last_error: &Arc<LastError>) -> Self {
-        Self { identities: Arc::clone(identities), last_error: Arc::clone(last_error) }
+        Self {
+            identities: Arc::clone(identities),
+            last_error: Arc::clone(last_error),
+            served: AtomicUsize::new(0),
+        }
+    }
+
+    /// How many lines of the log and errors the client has been served so far.
+    pub(super) fn served(&self) -> usize {
+        self.served.load(Ordering::Relaxed)
     }
 }
 
 impl ClientContext for ReadContext {
     fn log(&self, level: RDKafkaLogLevel, facility: &str, line: &str) {
+        self.served.fetch_add(1, Ordering::Relaxed);
         if matches!(level, RDKafkaLogLevel::Debug) && facility == "METADATA" {
             self.identities.read_log(line);
         }
@@ -77,6 +103,7 @@ impl ClientContext for ReadContext {
     }
 
     fn error(&self, error: KafkaError, reason: &str) {
+        self.served.fetch_add(1, Ordering::Relaxed);
         self.last_error.note_event(&error, reason);
     }
 }

@@ -14,9 +14,11 @@ use super::context::ReadContext;
 use super::identity::{Identities, TopicUuid};
 use super::inner::Shared;
 
-/// How long the log is read for an identity that is not there yet.
-const IDENTITY_TURN: Duration = Duration::from_millis(1);
+/// How often the log is looked at for an identity that is not there yet, and the pause between.
 const IDENTITY_TURNS: usize = 10;
+const IDENTITY_PAUSE: Duration = Duration::from_millis(1);
+/// Lines of a client's log that are served at once, at most.
+const LINES: usize = 100_000;
 /// How long to wait before a question is asked again that could not be answered yet.
 const AGAIN: Duration = Duration::from_millis(20);
 
@@ -124,9 +126,7 @@ impl Directory {
     ) -> Result<Listing, LookupError> {
         let client = self.client()?;
         let metadata = client.fetch_metadata(topic, timeout);
-        // Serves all there is of the client's log and errors: without a time it would serve one
-        // line alone.
-        client.poll(IDENTITY_TURN);
+        serve(&client);
         let metadata = metadata?;
         let good =
             |topic: &&MetadataTopic| topic.error().is_none() && !topic.partitions().is_empty();
@@ -156,11 +156,12 @@ impl Directory {
         // What the log says of the identity was queued before the answer.
         let mut turns = 0;
         loop {
-            client.poll(IDENTITY_TURN);
+            serve(&client);
             turns += 1;
             if self.identities.of(topic).is_some() || turns == IDENTITY_TURNS {
                 break;
             }
+            std::thread::sleep(IDENTITY_PAUSE);
         }
         Ok(TopicInfo { uuid: self.identities.of(topic), partitions })
     }
@@ -181,7 +182,7 @@ impl Directory {
         let mark = |partition: usize| loop {
             let left = deadline.saturating_duration_since(Instant::now());
             let number = i32::try_from(partition).unwrap_or(i32::MAX);
-            match client.fetch_watermarks(topic, number, left.max(IDENTITY_TURN)) {
+            match client.fetch_watermarks(topic, number, left.max(IDENTITY_PAUSE)) {
                 Ok((low, high)) => return Ok(Marks { low, high }),
                 Err(error) if is_passing(&error) && left > AGAIN => std::thread::sleep(AGAIN),
                 Err(error) => return Err(error.into()),
@@ -215,6 +216,19 @@ impl Directory {
     pub(super) fn close(&self) {
         let client = self.client.lock().take();
         drop(client);
+    }
+}
+
+/// Serves all that there is of a client's log and errors. Without a time to wait, the client serves
+/// one line a call; with one, it spins through the last millisecond.
+fn serve(client: &Client) {
+    let context = client.context();
+    for _ in 0..LINES {
+        let before = context.served();
+        client.poll(Duration::ZERO);
+        if context.served() == before {
+            break;
+        }
     }
 }
 

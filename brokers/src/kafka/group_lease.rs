@@ -96,6 +96,7 @@ impl GroupLease {
             last_error: Arc::default(),
             stop: stop.clone(),
             is_warned: false,
+            secrets: 0,
             consumer: None,
             asked: None,
             is_held: false,
@@ -207,6 +208,8 @@ struct Member {
     stop: CancellationToken,
     /// A refusal was logged since the lease was last held.
     is_warned: bool,
+    /// [`Settings::secrets`] that the consumer was made with.
+    secrets: u64,
     consumer: Option<BaseConsumer<Context>>,
     /// When the last question was dealt with.
     asked: Option<Instant>,
@@ -275,6 +278,7 @@ impl Member {
             stop: self.stop.clone(),
         };
         let away = |error: KafkaError| error.to_string();
+        self.secrets = self.settings.secrets();
         let config = self.settings.lease_member(&self.options.group, session);
         let consumer: BaseConsumer<Context> = config.create_with_context(context).map_err(away)?;
         consumer.subscribe(&[&self.topic]).map_err(away)?;
@@ -331,8 +335,11 @@ impl Member {
         let held = self.ask(&consumer, note, now);
         let is_gone = held.as_ref().is_err_and(is_topic_gone);
         let trouble = consumer.context().trouble.lock().clone();
+        // A server that refuses a password wants the present one.
+        let is_over = consumer.context().promised.lock().is_none_or(|until| until <= now);
+        let is_refused = held.is_err() && is_over && self.settings.secrets() != self.secrets;
         self.consumer = Some(consumer);
-        if is_gone {
+        if is_gone || is_refused {
             self.leave();
         }
         let held = held.map_err(|error| error.to_string());

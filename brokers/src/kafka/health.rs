@@ -22,6 +22,10 @@ const BUSY: Duration = Duration::from_millis(200);
 const MAX_ASKED: usize = 512;
 /// Topics that are asked for one by one in a round.
 const PER_ROUND: usize = 8;
+/// Rounds in which each topic that is read is looked at once, at least.
+const ROUNDS: usize = 4;
+/// Rounds without anything missing after which the client that makes topics is ended.
+const CALM_ROUNDS: usize = 20;
 
 /// How often the clients that read and write are asked whether they get answers.
 const LOOK: Duration = Duration::from_secs(5);
@@ -46,6 +50,8 @@ enum Client {
 struct Silent {
     since: HashMap<Client, Instant>,
     looked: Option<Instant>,
+    /// The client that asks was made anew since the last answer.
+    asked_anew: bool,
 }
 
 impl Silent {
@@ -105,10 +111,15 @@ impl Silent {
 /// Runs until the broker is closed.
 pub(super) fn run(inner: &Inner) {
     let mut turn = 0_usize;
-    let mut silent = Silent::default();
+    let (mut silent, mut calm_rounds) = (Silent::default(), 0_usize);
     while !inner.shared.stop.is_cancelled() {
         let calm = round(inner, turn, &mut silent);
         turn = turn.wrapping_add(1);
+        calm_rounds = if calm { calm_rounds + 1 } else { 0 };
+        if calm_rounds == CALM_ROUNDS {
+            inner.close_admin();
+            calm_rounds = 0;
+        }
         if !inner.shared.stop.is_cancelled() {
             inner.waker.wait(if calm { CALM } else { BUSY });
         }
@@ -126,8 +137,9 @@ fn round(inner: &Inner, turn: usize, silent: &mut Silent) -> bool {
     let answered = listed.as_ref().is_ok_and(|listing| listing.brokers > 0);
     if silent.note(Client::Directory, Instant::now(), answered) {
         tracing::debug!("the client that asks is made anew");
-        if let Err(error) = inner.directory.remake() {
-            inner.shared.last_error.note(error.to_string());
+        match inner.directory.remake() {
+            Ok(()) => silent.asked_anew = true,
+            Err(error) => inner.shared.last_error.note(error.to_string()),
         }
     }
     if !answered {
@@ -140,6 +152,11 @@ fn round(inner: &Inner, turn: usize, silent: &mut Silent) -> bool {
     };
     if let Some(reason) = inner.shared.supervisor.failure() {
         return lost(inner, &reason);
+    }
+    // One broker of several may refuse what the others do not ask for again.
+    let is_refused = inner.shared.last_error.take_refused();
+    if std::mem::take(&mut silent.asked_anew) || is_refused {
+        inner.follow_secrets();
     }
     if let Some(flow) = &inner.flow {
         flow.follow_leases_topic(inner, &listing);
@@ -230,9 +247,9 @@ fn learn_limits(inner: &Inner, found: &HashMap<String, usize>) {
     }
 }
 
-/// Whether it is the turn of a topic with this number, of so many.
-fn has_turn(number: usize, count: usize, turn: usize) -> bool {
-    let rounds = count.div_ceil(PER_ROUND).max(1);
+/// Whether it is the turn of a topic with this number, of so many, in at least so many rounds.
+fn has_turn(number: usize, count: usize, least: usize, turn: usize) -> bool {
+    let rounds = count.div_ceil(PER_ROUND).max(least);
     number % rounds == turn % rounds
 }
 
@@ -248,13 +265,13 @@ fn keep_reading(inner: &Inner, consumer: &Consumer, listing: &Listing, turn: usi
             && if is_creator {
                 listing.topics.contains_key(&*known.topic)
             } else {
-                has_turn(*number, waiting, turn)
+                has_turn(*number, waiting, 1, turn)
             }
     });
-    let read = read
-        .into_iter()
-        .enumerate()
-        .filter(|(number, known)| known.is_idle || lost_position || has_turn(*number, count, turn));
+    let read = read.into_iter().enumerate().filter(|(number, known)| {
+        let least = if known.is_behind { 1 } else { ROUNDS };
+        known.is_idle || lost_position || has_turn(*number, count, least, turn)
+    });
     for (_, known) in awaited.chain(read) {
         let topic = &known.topic;
         let deadline = Instant::now() + ANSWER;

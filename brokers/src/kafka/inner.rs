@@ -52,6 +52,8 @@ pub(super) struct Clients {
 /// What all clients of one broker use.
 pub(super) struct Shared {
     pub(super) settings: Settings,
+    /// [`Settings::secrets`] that clients were last made with.
+    secrets: Mutex<u64>,
     pub(super) gate: Gate,
     pub(super) clock: Mutex<BrokerClock>,
     pub(super) last_error: Arc<LastError>,
@@ -62,6 +64,7 @@ pub(super) struct Shared {
 impl Shared {
     pub(super) fn new(settings: Settings) -> Arc<Self> {
         Arc::new(Self {
+            secrets: Mutex::new(settings.secrets()),
             settings,
             gate: Gate::default(),
             clock: Mutex::new(BrokerClock::new(Instant::now())),
@@ -69,6 +72,12 @@ impl Shared {
             supervisor: Supervisor::new("kafka"),
             stop: CancellationToken::new(),
         })
+    }
+
+    /// Whether passwords and certificates are others than at the last call, or the start.
+    fn secrets_changed(&self) -> bool {
+        let now = self.settings.secrets();
+        std::mem::replace(&mut *self.secrets.lock(), now) != now
     }
 }
 
@@ -157,6 +166,27 @@ impl Inner {
             Consumer::start(large, &self.layer, &self.shared).map_err(BrokerError::Away)?;
         clients.consumers.insert(large, Arc::clone(&consumer));
         Ok(consumer)
+    }
+
+    /// Makes all clients anew if passwords and certificates are others than those that they began
+    /// with. Blocks while the old ones end.
+    pub(super) fn follow_secrets(&self) {
+        if !self.shared.secrets_changed() {
+            return;
+        }
+        tracing::info!("passwords or certificates of Kafka are others now: connecting anew");
+        if let Err(error) = self.directory.remake() {
+            self.shared.last_error.note(error.to_string());
+        }
+        self.close_admin();
+        for producer in self.producers() {
+            producer.remake();
+        }
+        for consumer in self.consumers() {
+            if let Err(error) = consumer.remake() {
+                self.shared.last_error.note(error);
+            }
+        }
     }
 
     pub(super) fn wake_writers(&self) {

@@ -1,8 +1,12 @@
 //! What the clients of librdkafka are told.
 
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_domain::node_file::KafkaBroker as Section;
+use parking_lot::Mutex;
 use rdkafka::ClientConfig;
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::KafkaError;
@@ -15,13 +19,15 @@ const MESSAGE_MAX_BYTES: &str = "17825792";
 /// Most that one fetch brings together, beside that one record.
 const FETCH_MAX_BYTES: &str = "18874368";
 /// How long the server may keep a fetch that has nothing to give, in milliseconds. A partition that
-/// joins waits for that.
-const FETCH_WAIT_MS: &str = "50";
+/// joins waits for that; each answer costs both sides a tenth of a millisecond of processor time.
+const FETCH_WAIT_MS: &str = "200";
 /// Identities of topics come with this part of the debug log.
 const DEBUG: &str = "topic";
 /// A consumer needs a group, though it never joins one.
 const GROUP: &str = "blaze";
 
+/// The property that the password of an account goes to.
+const PASSWORD: &str = "sasl.password";
 /// What properties of accounts and of TLS begin with.
 const ACCOUNT_KEYS: [&str; 3] = ["sasl.", "security.", "ssl."];
 
@@ -101,6 +107,48 @@ impl Lot {
 pub(super) struct Settings {
     base: ClientConfig,
     given: Vec<(String, String)>,
+    password: Option<PasswordFile>,
+}
+
+/// A password in a file, which may be replaced while clients run.
+#[derive(Clone)]
+struct PasswordFile {
+    path: PathBuf,
+    /// As it was read last.
+    read: Arc<Mutex<String>>,
+}
+
+impl PasswordFile {
+    fn open(path: &Path) -> Result<Self, OpenError> {
+        let file = Self { path: path.to_owned(), read: Arc::default() };
+        let unreadable = |error: std::io::Error| OpenError::Setting {
+            key: "kafka.password_file".to_owned(),
+            reason: format!("{}: {error}", path.display()),
+        };
+        *file.read.lock() = file.content().map_err(unreadable)?;
+        Ok(file)
+    }
+
+    /// A file that is empty is one that is just being written.
+    fn content(&self) -> std::io::Result<String> {
+        let text = std::fs::read_to_string(&self.path)?;
+        match text.trim_end_matches(['\r', '\n']) {
+            "" => Err(std::io::Error::new(std::io::ErrorKind::InvalidData, "it is empty")),
+            password => Ok(password.to_owned()),
+        }
+    }
+
+    /// What the file holds now. While it cannot be read, what it held last.
+    fn now(&self) -> String {
+        let mut read = self.read.lock();
+        match self.content() {
+            Ok(text) => *read = text,
+            Err(error) => tracing::warn!(
+                file = %self.path.display(), %error, "the password of Kafka cannot be read again",
+            ),
+        }
+        read.clone()
+    }
 }
 
 impl Settings {
@@ -124,12 +172,15 @@ impl Settings {
             check_property(key, value.reveal())?;
             given.push((key.clone(), value.reveal().to_owned()));
         }
-        let settings = Self { base, given };
+        let password = section.password_file.as_deref().map(PasswordFile::open).transpose()?;
+        let settings = Self { base, given, password };
         // One of each kind, as each has its own rules for what goes together.
         settings.check(&settings.consumer(false), "consumers")?;
         settings
             .check(&settings.producer(Lot { reliable: true, large: false }, None), "producers")?;
-        if settings.given.iter().any(|(key, _)| ACCOUNT_KEYS.iter().any(|of| key.starts_with(of))) {
+        let of_account =
+            |(key, _): &(String, String)| ACCOUNT_KEYS.iter().any(|of| key.starts_with(of));
+        if settings.password.is_some() || settings.given.iter().any(of_account) {
             settings.check_account()?;
         }
         Ok(settings)
@@ -157,9 +208,24 @@ impl Settings {
         let secret = |(key, value): &(String, String)| {
             !key.ends_with(".location") && text.contains(value.as_str())
         };
-        let reason =
-            if self.given.iter().any(secret) { otherwise.to_owned() } else { text.clone() };
+        let password = self.password.as_ref().map(|file| file.read.lock().clone());
+        let is_secret = self.given.iter().any(secret)
+            || password.is_some_and(|password| text.contains(&password));
+        let reason = if is_secret { otherwise.to_owned() } else { text.clone() };
         OpenError::Setting { key: "kafka.properties".to_owned(), reason }
+    }
+
+    /// Stands for what the files of passwords and certificates hold now: another number, other
+    /// content.
+    pub(super) fn secrets(&self) -> u64 {
+        let of_file = |(key, path): &(String, String)| {
+            key.ends_with(".location").then(|| std::fs::read(path).ok())
+        };
+        let files: Vec<_> = self.given.iter().filter_map(of_file).collect();
+        let password = self.password.as_ref().map(PasswordFile::now);
+        let mut hasher = DefaultHasher::new();
+        (files, password).hash(&mut hasher);
+        hasher.finish()
     }
 
     /// Where the server is, for people.
@@ -175,6 +241,9 @@ impl Settings {
         }
         for (key, value) in &self.given {
             config.set(key, value);
+        }
+        if let Some(password) = &self.password {
+            config.set(PASSWORD, password.now());
         }
         for (key, value) in fixed {
             config.set(*key, *value);

@@ -145,6 +145,7 @@ impl BrokerSource {
                     let section = LayerSection::Kafka(KafkaBroker {
                         bootstrap: vec![bootstrap],
                         prefix: prefix.clone(),
+                        password_file: None,
                         properties: BTreeMap::new(),
                     });
                     let broker = open_layer(&section, &role).map_err(fault)?;

@@ -156,6 +156,8 @@ pub struct KafkaBroker {
     pub bootstrap: Vec<String>,
     /// Stands before every name on this broker.
     pub prefix: String,
+    /// File that holds the password of an account, `sasl.password`.
+    pub password_file: Option<PathBuf>,
     /// Further properties of the client library.
     pub properties: BTreeMap<String, SecretText>,
 }
@@ -169,8 +171,12 @@ impl KafkaBroker {
             list => Some(list),
         });
         let prefix = s.or("prefix", prefix, String::new());
+        let password_file = s.opt("password_file", path);
         let properties = s.opt("properties", properties).unwrap_or_default();
-        Some(Self { bootstrap: bootstrap?, prefix, properties })
+        if password_file.is_some() && properties.contains_key("sasl.password") {
+            return s.node.fault("password_file and properties.sasl.password exclude each other");
+        }
+        Some(Self { bootstrap: bootstrap?, prefix, password_file, properties })
     }
 }
 

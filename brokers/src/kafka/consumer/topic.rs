@@ -151,6 +151,11 @@ impl TopicState {
         self.identify(Some(uuid), layer);
     }
 
+    /// Whether records waited at the last [`TopicState::watch`].
+    pub(super) fn is_behind(&self) -> bool {
+        self.behind.is_some()
+    }
+
     /// Looks whether it stands still although records wait. The client library gives a partition up
     /// that had no leader at the moment when it was to be read (a topic that was just made, a
     /// broker that was fenced); asked again, it goes on.

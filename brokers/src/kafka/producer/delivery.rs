@@ -71,7 +71,7 @@ impl ClientContext for SharedContext {
 
     fn error(&self, error: KafkaError, reason: &str) {
         if error.rdkafka_error_code() == Some(RDKafkaErrorCode::Fatal) {
-            self.0.fatal.store(true, Ordering::Release);
+            self.0.ask_for_new_clients();
         }
         self.0.shared.last_error.note_event(&error, reason);
     }
@@ -98,6 +98,12 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
 }
 
 impl WriteContext {
+    /// Nothing more is handed over until the poll thread has made the clients anew.
+    pub(in crate::kafka) fn ask_for_new_clients(&self) {
+        self.fatal.store(true, Ordering::Release);
+        self.prompt.wake();
+    }
+
     /// What wakes the poll thread of a client.
     pub(in crate::kafka) fn waker(&self, which: Which) -> &ThreadWaker {
         match which {
@@ -143,7 +149,7 @@ impl WriteContext {
             topic.doubt_limit();
         }
         if matches!(code, Some(RDKafkaErrorCode::Fatal)) {
-            self.fatal.store(true, Ordering::Release);
+            self.ask_for_new_clients();
         }
         let reason = reason_of(code);
         if is_message && reason == DropReason::BrokerError && self.is_warning_due() {

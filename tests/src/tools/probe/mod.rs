@@ -152,6 +152,7 @@ fn open(options: &Options) -> anyhow::Result<Arc<dyn Broker>> {
             let section = KafkaBroker {
                 bootstrap: vec![bootstrap.clone()],
                 prefix,
+                password_file: None,
                 properties: BTreeMap::new(),
             };
             open_layer(&LayerBroker::Kafka(section), &role)?

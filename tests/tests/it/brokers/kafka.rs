@@ -42,6 +42,7 @@ pub(crate) fn section(server: &KafkaServer, prefix: &str) -> Section {
     Section {
         bootstrap: vec![server.bootstrap()],
         prefix: prefix.to_owned(),
+        password_file: None,
         properties: BTreeMap::new(),
     }
 }

@@ -57,6 +57,7 @@ async fn on_cloud(system: &RobotAndCloud, name: &str) -> anyhow::Result<ServiceM
     let section = KafkaBroker {
         bootstrap: vec![system.kafka.clone()],
         prefix: system.kafka_prefix.clone(),
+        password_file: None,
         properties: Default::default(),
     };
     let broker = open_layer(&LayerBroker::Kafka(section), &Role::Service)?;
