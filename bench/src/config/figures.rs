@@ -159,7 +159,7 @@ impl Row {
             p50_ms: figures.p50_ms,
             p99_ms: figures.p99_ms,
             to_etcd: None,
-            bar: load.bar(),
+            bar: load.bar(subject.contains("sqlite")),
             server_cpu_us: per_operation(used.server),
             database_cpu_us: used.database.map(per_operation),
             client_cpu_us: per_operation(used.client),

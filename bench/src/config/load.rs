@@ -49,13 +49,14 @@ impl Load {
         }
     }
 
-    /// What BlazeConfig must reach, over gRPC.
-    pub(crate) fn bar(&self) -> Option<Bar> {
+    /// What BlazeConfig must reach, over gRPC, with this store.
+    pub(crate) fn bar(&self, is_sqlite: bool) -> Option<Bar> {
+        let of = |sqlite, mongodb| if is_sqlite { sqlite } else { mongodb };
         match self {
-            Self::Closed { work: Work::Get, .. } => Some(Bar::AtLeast(1.0)),
-            Self::Closed { work: Work::Put, .. } => Some(Bar::AtLeast(0.3)),
+            Self::Closed { work: Work::Get, .. } => Some(Bar::AtLeast(1.8)),
+            Self::Closed { work: Work::Put, .. } => Some(Bar::AtLeast(of(0.6, 0.3))),
             Self::Closed { work: Work::Apply, .. } => None,
-            Self::FanOut { .. } => Some(Bar::AtMost(2.0)),
+            Self::FanOut { .. } => Some(Bar::AtMost(of(1.2, 2.0))),
         }
     }
 

@@ -22,17 +22,20 @@ pub(crate) trait Sink: Send {
     fn poll(&mut self, found: &mut dyn FnMut(&[u8])) -> anyhow::Result<()>;
 }
 
-/// Pipelined PUBLISH.
+/// PUBLISH, pipelined.
 pub(crate) struct RedisSource {
     connection: redis::Connection,
+    /// Commands of a pipeline, at most.
+    together: usize,
     channel: String,
     pipeline: redis::Pipeline,
     waiting: usize,
 }
 
 impl RedisSource {
-    pub(crate) fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
+    pub(crate) fn new(url: &str, channel: &str, together: usize) -> anyhow::Result<Self> {
         Ok(Self {
+            together,
             connection: redis::Client::open(url)?.get_connection()?,
             channel: channel.to_owned(),
             pipeline: redis::pipe(),
@@ -45,7 +48,7 @@ impl Source for RedisSource {
     fn send(&mut self, payload: &[u8]) -> anyhow::Result<()> {
         self.pipeline.cmd("PUBLISH").arg(&self.channel).arg(payload).ignore();
         self.waiting += 1;
-        if self.waiting >= 64 { self.flush() } else { Ok(()) }
+        if self.waiting >= self.together { self.flush() } else { Ok(()) }
     }
 
     fn flush(&mut self) -> anyhow::Result<()> {

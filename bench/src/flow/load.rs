@@ -23,6 +23,8 @@ const WINDOW_MESSAGES: u64 = 2_048;
 pub(crate) enum Load {
     /// At a rate in Hz, with payloads of so many bytes.
     Paced(f64, usize),
+    /// The same, each published by itself, as a service does that publishes what it has at once.
+    Single(f64, usize),
     /// As fast as it arrives at the other end.
     Full(usize),
 }
@@ -34,6 +36,7 @@ impl Load {
             Self::Paced(50.0, 1_000),
             Self::Paced(10_000.0, 300),
             Self::Paced(10_000.0, 1_000),
+            Self::Single(10_000.0, 1_000),
             Self::Full(300),
             Self::Full(1_000),
             Self::Paced(10.0, 1_000_000),
@@ -44,20 +47,29 @@ impl Load {
     pub(crate) fn name(self) -> String {
         match self {
             Self::Paced(rate, bytes) => format!("{rate} Hz, {bytes} B"),
+            Self::Single(rate, bytes) => format!("{rate} Hz singly, {bytes} B"),
             Self::Full(bytes) => format!("full speed, {bytes} B"),
         }
     }
 
     pub(crate) fn bytes(self) -> usize {
         match self {
-            Self::Paced(_, bytes) | Self::Full(bytes) => bytes,
+            Self::Paced(_, bytes) | Self::Single(_, bytes) | Self::Full(bytes) => bytes,
         }
     }
 
     pub(crate) fn rate_hz(self) -> Option<f64> {
         match self {
-            Self::Paced(rate, _) => Some(rate),
+            Self::Paced(rate, _) | Self::Single(rate, _) => Some(rate),
             Self::Full(_) => None,
+        }
+    }
+
+    /// Messages that are sent together, at most.
+    pub(crate) fn together(self) -> usize {
+        match self {
+            Self::Single(..) => 1,
+            Self::Paced(..) | Self::Full(_) => 64,
         }
     }
 }
@@ -176,12 +188,14 @@ impl Sender<'_> {
 
     fn run_for(&mut self, duration: Duration) -> anyhow::Result<()> {
         match self.load {
-            Load::Paced(rate, _) => self.paced(rate, duration),
+            // A thread that wakes for every message at 10,000 Hz would measure itself.
+            Load::Paced(rate, _) => self.paced(rate, duration, Duration::from_micros(500)),
+            Load::Single(rate, _) => self.paced(rate, duration, Duration::ZERO),
             Load::Full(bytes) => self.full(bytes, duration),
         }
     }
 
-    fn paced(&mut self, rate: f64, duration: Duration) -> anyhow::Result<()> {
+    fn paced(&mut self, rate: f64, duration: Duration, rest: Duration) -> anyhow::Result<()> {
         let begin = Instant::now();
         let mut count = 0_u64;
         while begin.elapsed() < duration {
@@ -192,10 +206,7 @@ impl Sender<'_> {
             }
             self.source.flush()?;
             let next = begin + Duration::from_secs_f64(count as f64 / rate);
-            // A thread that wakes for every message at 10,000 Hz would measure itself.
-            let pause =
-                next.saturating_duration_since(Instant::now()).max(Duration::from_micros(500));
-            std::thread::sleep(pause);
+            std::thread::sleep(next.saturating_duration_since(Instant::now()).max(rest));
         }
         Ok(())
     }

@@ -106,7 +106,7 @@ pub(crate) fn run(arguments: Arguments) -> anyhow::Result<()> {
     let run = format!("bench-{}", std::process::id());
     let duration = Duration::from_secs_f64(arguments.seconds);
     println!(
-        "{:<27} {:<22} {:>9} {:>8} {:>9} {:>9} {:>9} {:>13}  DROPPED",
+        "{:<27} {:<25} {:>9} {:>8} {:>9} {:>9} {:>9} {:>13}  DROPPED",
         "PATH", "LOAD", "SENT", "LOST", "MSG/S", "p50/ms", "p99/ms", "FLOW us/MSG"
     );
     for kind in PathKind::ALL.into_iter().filter(|kind| kind.name().contains(&arguments.only)) {
@@ -159,7 +159,7 @@ fn measure(
     };
     let mut source: Box<dyn Source> = match kind {
         PathKind::KafkaAlone => Box::new(KafkaSource::new(kafka, &kafka_topic)?),
-        _ => Box::new(RedisSource::new(redis, &redis_channel)?),
+        _ => Box::new(RedisSource::new(redis, &redis_channel, load.together())?),
     };
     let sink: Box<dyn Sink> = match kind {
         PathKind::RedisAlone => Box::new(RedisSink(RedisReader::new(redis, &redis_channel)?)),
@@ -178,7 +178,7 @@ fn print_row(kind: PathKind, load: Load, figures: &Figures, dropped: &str) {
         "-".to_owned()
     };
     println!(
-        "{:<27} {:<22} {:>9} {:>8} {:>9.0} {:>9.3} {:>9.3} {:>13}  {dropped}",
+        "{:<27} {:<25} {:>9} {:>8} {:>9.0} {:>9.3} {:>9.3} {:>13}  {dropped}",
         kind.name(),
         load.name(),
         figures.sent,
