@@ -60,10 +60,14 @@ pub enum Align {
     Right,
 }
 
-/// Width of the terminal in columns; `None` when standard output is none.
+/// Columns of a terminal for which a table is worth wrapping. One that nobody has told its size says
+/// that it has none.
+const NARROWEST: u16 = 40;
+
+/// Width of the terminal in columns; `None` when standard output is none, or it is too narrow.
 #[must_use]
 pub fn terminal_width() -> Option<u16> {
-    Table::new().width()
+    Table::new().width().filter(|width| *width >= NARROWEST)
 }
 
 /// A column: its heading, where its content stands, and what it shows of an item.
