@@ -139,7 +139,7 @@ impl Producer {
                 outbox,
                 prompt: ThreadWaker::default(),
                 gathering: ThreadWaker::default(),
-                fatal: AtomicBool::new(false),
+                wants_new_clients: AtomicBool::new(false),
                 warned: Mutex::new(None),
             }),
             handing_over: AtomicBool::new(false),
@@ -260,7 +260,9 @@ impl Producer {
     }
 
     fn hand_over_what_fits(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
-        while self.shared().gate.is_open() && !self.context.fatal.load(Ordering::Acquire) {
+        while self.shared().gate.is_open()
+            && !self.context.wants_new_clients.load(Ordering::Acquire)
+        {
             let in_flight = self.context.in_flight.load(Ordering::Acquire);
             if in_flight >= WINDOW {
                 return;
@@ -336,7 +338,7 @@ impl Producer {
         done: oneshot::Sender<Fate>,
     ) {
         // Dropped, `done` says that it was not taken.
-        if self.context.fatal.load(Ordering::Acquire) {
+        if self.context.wants_new_clients.load(Ordering::Acquire) {
             return;
         }
         let Some(clients) = self.clients.lock().clone() else {
@@ -372,7 +374,8 @@ impl Producer {
         }
     }
 
-    /// Runs the callbacks until the end, and makes the clients anew after a fatal error.
+    /// Runs the callbacks until the end, and makes the clients anew after a fatal error and when
+    /// that is asked for.
     fn poll(&self) {
         let stop = &self.shared().stop;
         self.warm_up(Which::Prompt);
@@ -385,7 +388,7 @@ impl Producer {
                 let fatal = clients.prompt.client().fatal_error();
                 let fatal = fatal.or_else(|| clients.gathering.client().fatal_error());
                 is_fatal = fatal.is_some();
-                if !is_fatal && !self.context.fatal.load(Ordering::Acquire) {
+                if !is_fatal && !self.context.wants_new_clients.load(Ordering::Acquire) {
                     continue;
                 }
                 let reason = fatal.map_or_else(
@@ -412,7 +415,7 @@ impl Producer {
                     std::thread::sleep(REMAKE);
                 }
             }
-            self.context.fatal.store(false, Ordering::Release);
+            self.context.wants_new_clients.store(false, Ordering::Release);
             // It may hold the old ones, too.
             self.context.gathering.wake();
             drop(clients);

@@ -55,7 +55,8 @@ pub(in crate::kafka) struct WriteContext {
     pub(in crate::kafka) gathering: ThreadWaker,
     /// Where messages wait; its ring wakes the feeding thread.
     pub(in crate::kafka) outbox: Arc<Outbox<Target>>,
-    pub(in crate::kafka) fatal: AtomicBool,
+    /// The poll thread is to make the clients anew.
+    pub(in crate::kafka) wants_new_clients: AtomicBool,
     /// When a loss was last said in the log.
     pub(in crate::kafka) warned: Mutex<Option<Instant>>,
     pub(in crate::kafka) shared: Arc<Shared>,
@@ -100,7 +101,7 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
 impl WriteContext {
     /// Nothing more is handed over until the poll thread has made the clients anew.
     pub(in crate::kafka) fn ask_for_new_clients(&self) {
-        self.fatal.store(true, Ordering::Release);
+        self.wants_new_clients.store(true, Ordering::Release);
         self.prompt.wake();
     }
 
