@@ -16,8 +16,8 @@ use crate::link::{Engine, LinkBudgets, LinkCapacity, PacketSize};
 
 impl Shared {
     /// Works out the rates of lanes where something has changed that they depend on; to be called
-    /// every few ten milliseconds. The work is done outside of the lock of the message path, which is
-    /// taken for reading what there is and for setting the rates.
+    /// with each tick of the control task. The work is done outside of the lock of the message
+    /// path, which is taken for reading what there is and for setting the rates.
     pub(super) fn allocate(&self, now: Instant) {
         let mut limiter = self.limiter.lock();
         if limiter.is_time_to_look(now) {
