@@ -12,7 +12,7 @@ use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::KafkaError;
 use rdkafka::producer::BaseProducer;
 
-use crate::open::OpenError;
+use crate::open::{OpenError, read_password};
 
 /// Largest record, in bytes: the largest payload, and a mebibyte for everything around it.
 const MESSAGE_MAX_BYTES: &str = "17825792";
@@ -121,31 +121,18 @@ struct PasswordFile {
 impl PasswordFile {
     fn open(path: &Path) -> Result<Self, OpenError> {
         let file = Self { path: path.to_owned(), read: Arc::default() };
-        let unreadable = |error: std::io::Error| OpenError::Setting {
-            key: "kafka.password_file".to_owned(),
-            reason: format!("{}: {error}", path.display()),
-        };
-        *file.read.lock() = file.content().map_err(unreadable)?;
+        let unreadable =
+            |reason| OpenError::Setting { key: "kafka.password_file".to_owned(), reason };
+        *file.read.lock() = read_password(path).map_err(unreadable)?;
         Ok(file)
-    }
-
-    /// A file that is empty is one that is just being written.
-    fn content(&self) -> std::io::Result<String> {
-        let text = std::fs::read_to_string(&self.path)?;
-        match text.trim_end_matches(['\r', '\n']) {
-            "" => Err(std::io::Error::new(std::io::ErrorKind::InvalidData, "it is empty")),
-            password => Ok(password.to_owned()),
-        }
     }
 
     /// What the file holds now. While it cannot be read, what it held last.
     fn now(&self) -> String {
         let mut read = self.read.lock();
-        match self.content() {
+        match read_password(&self.path) {
             Ok(text) => *read = text,
-            Err(error) => tracing::warn!(
-                file = %self.path.display(), %error, "the password of Kafka cannot be read again",
-            ),
+            Err(error) => tracing::warn!(error, "the password of Kafka cannot be read again"),
         }
         read.clone()
     }

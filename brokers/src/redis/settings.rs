@@ -1,6 +1,5 @@
 //! From the section of the node file to a client of the library, and the names on the server.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -9,7 +8,7 @@ use blaze_domain::node_file::RedisBroker as Section;
 use redis::io::tcp::TcpSettings;
 use redis::{ConnectionInfo, IntoConnectionInfo, ProtocolVersion};
 
-use crate::open::OpenError;
+use crate::open::{OpenError, read_password};
 
 /// After this time without a sign from the other host a connection is dead.
 const USER_TIMEOUT: Duration = Duration::from_secs(10);
@@ -87,15 +86,10 @@ fn with_login(info: ConnectionInfo, section: &Section) -> Result<ConnectionInfo,
         login = login.set_username(user);
     }
     if let Some(path) = &section.password_file {
-        let password = read_text("redis.password_file", path)?;
-        login = login.set_password(password.trim_end_matches(['\r', '\n']));
+        let password = read_password(path).map_err(|error| fault("redis.password_file", error))?;
+        login = login.set_password(password);
     }
     Ok(info.set_redis_settings(login))
-}
-
-fn read_text(key: &str, path: &Path) -> Result<String, OpenError> {
-    std::fs::read_to_string(path)
-        .map_err(|error| fault(key, format!("{}: {error}", path.display())))
 }
 
 fn plain(info: ConnectionInfo) -> Result<redis::Client, OpenError> {
@@ -125,7 +119,9 @@ fn secure(info: ConnectionInfo, section: &Section) -> Result<redis::Client, Open
     };
     let files = section.tls.clone().unwrap_or_default();
     let bytes = |key: &str, path: &Option<std::path::PathBuf>| {
-        path.as_ref().map(|path| read_text(key, path).map(String::into_bytes)).transpose()
+        let Some(path) = path else { return Ok(None) };
+        let read = std::fs::read(path);
+        read.map(Some).map_err(|error| fault(key, format!("{}: {error}", path.display())))
     };
     let root_cert = bytes("redis.tls.ca_file", &files.ca_file)?;
     let client_cert = bytes("redis.tls.cert_file", &files.cert_file)?;

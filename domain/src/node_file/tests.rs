@@ -251,6 +251,18 @@ fn secrets_are_not_repeated() {
 }
 
 #[test]
+fn a_password_of_kafka_stands_in_one_place() {
+    let tree = |properties: serde_json::Value| {
+        let kafka =
+            json!({ "bootstrap": ["h:1"], "password_file": "/f", "properties": properties });
+        json!({ "brokers": { "layer": { "kafka": kafka } } })
+    };
+    assert!(NodeFile::read(&tree(json!({}))).is_ok());
+    let found = faults(&tree(json!({ "sasl.password": "geheim" })));
+    assert!(found.len() == 1 && found[0].contains("exclude each other"), "{found:?}");
+}
+
+#[test]
 fn the_first_rule_that_gives_a_value_wins() {
     let tree = json!({ "flow": { "compression": { "level": 3 }, "topics": [
         { "match": "camera/*", "max_rate_hz": 15, "compression": { "level": 9 } },
