@@ -22,4 +22,4 @@ pub use supervisor::{
     ShutdownPhase, ShutdownReport, ShutdownSteps, Signals, StopOnDrop, Supervisor, TaskEnd,
     TaskHandle, TaskInfo, TaskPolicy, block_on, exit_code, say,
 };
-pub use ticks::ticks;
+pub use ticks::{BEAT, on_beat, pause, ticks};

@@ -118,8 +118,8 @@ impl Shown {
                 }
                 self.inner.lock().status = Some(status);
             }
-            let pause = if *self.begun.borrow() { REACH } else { FIRST_LOOK };
-            tokio::time::sleep(pause).await;
+            let rest = if *self.begun.borrow() { REACH } else { FIRST_LOOK };
+            blaze_runtime::pause(rest).await;
         }
     }
 

@@ -7,6 +7,7 @@ use std::time::Duration;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, BrokerStatus, Content, Health, SubscribeOptions};
 use blaze_domain::names::ChannelName;
+use blaze_runtime::pause;
 use bytes::Bytes;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep};
@@ -109,7 +110,7 @@ pub(crate) async fn scan(keys: Arc<RedisKeys>, signs: mpsc::Sender<Sign>) {
     let mut doubtful_until = Instant::now();
     let mut last_run = None;
     loop {
-        sleep(SCAN).await;
+        pause(SCAN).await;
         // Which run of the server it is is asked last: records that a restart has taken are then
         // known to be its doing.
         let found = match keys.records(RECORDS, MAX_SIGNS).await {

@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::RedisBroker as Section;
+use blaze_runtime::pause;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use redis::aio::MultiplexedConnection;
@@ -376,7 +377,7 @@ impl RedisKeys {
                     return;
                 }
             }
-            tokio::time::sleep(LOOK).await;
+            pause(LOOK).await;
         }
     }
 

@@ -3,18 +3,19 @@
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
+use blaze_runtime::BEAT;
 use tokio_util::sync::CancellationToken;
 
 /// Time between two looks.
-pub(super) const LOOK: Duration = Duration::from_millis(250);
+pub(super) const LOOK: Duration = BEAT.saturating_mul(3);
 /// Looks without a sign of life after which the server is pinged.
-const PING_AFTER: usize = 3;
+const PING_AFTER: usize = 4;
 /// Looks without a sign of life after which the server is silent: a freeze shows within 2 s.
-const SILENT_AFTER: usize = 7;
+const SILENT_AFTER: usize = 9;
 /// The same for connections of large messages: one message of 16 MiB takes 1.3 s at 100 Mbit/s.
-const SILENT_AFTER_LARGE: usize = 15;
+const SILENT_AFTER_LARGE: usize = 20;
 /// Bytes that a server takes per look at least (10 MB/s): what was sent may take its time.
-const BYTES_PER_LOOK: usize = 2_500_000;
+const BYTES_PER_LOOK: usize = 1_920_000;
 
 /// What is known of a connection. Several tasks write it.
 #[derive(Debug, Default)]
@@ -102,19 +103,19 @@ mod tests {
         let (mut watch, liveness) = (Watch::new(false), Liveness::default());
         for _ in 0..2 {
             liveness.received();
-            let found = looks(&mut watch, &liveness, 9);
-            assert_eq!((found[0], found[3]), (Look::Alive, Look::Ping));
-            assert_eq!(found.iter().position(|look| *look == Look::Silent), Some(7));
-            assert_eq!(found[8], Look::Silent);
+            let found = looks(&mut watch, &liveness, 11);
+            assert_eq!((found[0], found[4]), (Look::Alive, Look::Ping));
+            assert_eq!(found.iter().position(|look| *look == Look::Silent), Some(9));
+            assert_eq!(found[10], Look::Silent);
         }
-        assert!(LOOK * 8 <= Duration::from_secs(2));
+        assert!(LOOK * 10 <= Duration::from_secs(2));
     }
 
     #[test]
     fn what_was_sent_may_take_its_time() {
         let (mut watch, liveness) = (Watch::new(false), Liveness::default());
         liveness.sent(10_000_000);
-        assert!(!looks(&mut watch, &liveness, 10).contains(&Look::Silent));
+        assert!(!looks(&mut watch, &liveness, 13).contains(&Look::Silent));
         assert_eq!(watch.look(&liveness), Look::Silent);
         liveness.answered(10_000_000);
         assert_eq!((watch.look(&liveness), liveness.unanswered()), (Look::Alive, 0));

@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_runtime::pause;
 use redis::aio::MultiplexedConnection;
 use redis::{InfoDict, RedisResult};
 
@@ -25,7 +26,7 @@ async fn look_on(shared: &Shared, leases: Option<&Leases>) {
     let mut before = HashSet::new();
     let mut evictions = Evictions::default();
     loop {
-        tokio::time::sleep(LOOK).await;
+        pause(LOOK).await;
         let Some(connection) = shared.commands_now() else {
             before.clear();
             continue;

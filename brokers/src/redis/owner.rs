@@ -10,6 +10,7 @@
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
+use blaze_runtime::pause;
 use redis::aio::MultiplexedConnection;
 use redis::{RedisResult, Script};
 
@@ -198,7 +199,7 @@ async fn due(shared: &Shared, sent: Instant) {
         }
     };
     tokio::select! {
-        () = tokio::time::sleep(RENEW.saturating_sub(sent.elapsed())) => {}
+        () = pause(RENEW.saturating_sub(sent.elapsed())) => {}
         () = urgent => {}
     }
 }

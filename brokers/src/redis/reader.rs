@@ -5,7 +5,7 @@ use std::convert::Infallible;
 use std::time::{Duration, Instant};
 
 use blaze_domain::WriterId;
-use blaze_runtime::ticks;
+use blaze_runtime::{BEAT, ticks};
 use bytes::Bytes;
 use redis::RedisResult;
 use redis::aio::MultiplexedConnection;
@@ -19,7 +19,7 @@ use super::{Shared, server};
 use crate::port::{BrokerError, Content, Received};
 
 /// How often readers are looked for that have gone.
-const SWEEP: Duration = Duration::from_secs(1);
+const SWEEP: Duration = BEAT.saturating_mul(16);
 /// Until what is kept for late joiners must have been read.
 const READ_KEPT: Duration = Duration::from_secs(10);
 

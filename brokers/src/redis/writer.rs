@@ -4,7 +4,7 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_runtime::ticks;
+use blaze_runtime::{BEAT, ticks};
 use futures::StreamExt as _;
 use futures::future::BoxFuture;
 use futures::stream::FuturesOrdered;
@@ -30,7 +30,7 @@ const UNANSWERED_BYTES: usize = 1024 * 1024;
 /// How often refused messages are told.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
 /// How often what is kept of publishers that have gone is forgotten.
-const FORGET_EVERY: Duration = Duration::from_secs(10);
+const FORGET_EVERY: Duration = BEAT.saturating_mul(160);
 
 /// Bytes of a batch, and what the server said no to.
 type Answer = BoxFuture<'static, Result<(usize, Refusals), Failure>>;

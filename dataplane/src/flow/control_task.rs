@@ -14,7 +14,7 @@ use blaze_brokers::{
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WriterId};
 use blaze_proto::link::link_control::LayerScope;
-use blaze_runtime::ticks;
+use blaze_runtime::{BEAT, ticks};
 use bytes::Bytes;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
@@ -26,7 +26,7 @@ use crate::registry::peers_channel;
 use crate::world::FlowState;
 
 /// How often what is due is looked for.
-const TICK: Duration = Duration::from_millis(50);
+const TICK: Duration = BEAT;
 /// Between attempts to subscribe to a broker that is away.
 const RETRY: Duration = Duration::from_millis(250);
 /// How often it is measured what this flow carries.

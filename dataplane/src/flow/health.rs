@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use blaze_brokers::Health;
 use blaze_domain::Scope;
 use blaze_runtime::admin::{CheckStatus, Gate, Readiness};
-use blaze_runtime::ticks;
+use blaze_runtime::{BEAT, ticks};
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
@@ -21,7 +21,7 @@ use crate::world::FlowState;
 /// `why` looks at what happened during the last one to two of these.
 const MARK: Duration = Duration::from_secs(2);
 /// How often the health of brokers and link is looked at.
-const HEALTH: Duration = Duration::from_millis(200);
+const HEALTH: Duration = BEAT.saturating_mul(3);
 
 /// The checks of a flow, all of which fail at first.
 pub(super) fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {

@@ -18,7 +18,7 @@ use blaze_domain::FlowId;
 use blaze_domain::names::ChannelName;
 use blaze_proto::link::LinkControl;
 use blaze_proto::link::link_control::Body;
-use blaze_runtime::ticks;
+use blaze_runtime::{BEAT, ticks};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -26,7 +26,7 @@ use super::Shared;
 use crate::control::{ControlCore, LISTEN, read_replica_message};
 
 /// How often it is looked at who has gone silent.
-const LOOK: Duration = Duration::from_millis(250);
+const LOOK: Duration = BEAT.saturating_mul(4);
 /// A Hello counts this long.
 const LIVE: Duration = Duration::from_millis(2500);
 /// Flows that are followed.

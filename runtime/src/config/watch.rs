@@ -13,11 +13,12 @@ use std::time::Duration;
 use notify::event::{AccessKind, AccessMode, EventKind};
 use notify::{RecommendedWatcher, RecursiveMode, Watcher};
 use tokio::sync::{mpsc, watch as channel};
-use tokio::time::{Instant, MissedTickBehavior};
+use tokio::time::Instant;
 
 use super::compose::Composition;
 use super::{Loaded, LocatedFault, Overlay, Schema, Sources, Verdict};
 use crate::supervisor::{Supervisor, TaskPolicy};
+use crate::{BEAT, ticks};
 
 /// How changes are noticed.
 #[derive(Debug, Clone)]
@@ -36,7 +37,7 @@ impl Default for WatchSettings {
     fn default() -> Self {
         Self {
             debounce: Duration::from_millis(100),
-            poll: Duration::from_secs(2),
+            poll: BEAT.saturating_mul(32),
             directory_events: true,
             hangup: true,
         }
@@ -144,8 +145,9 @@ impl<T: Send + Sync + 'static> Task<T> {
         let (events, mut changed) = mpsc::channel(1);
         let mut directories = Directories::new(settings.directory_events.then(|| events.clone()));
         let mut hangup = Hangup::new(settings.hangup);
-        let mut poll = tokio::time::interval(settings.poll);
-        poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut poll = ticks(settings.poll);
+        // What changed since the first reading is found at once.
+        let mut is_first = true;
         // What is there before the first change counts too.
         overlays.mark_changed();
         loop {
@@ -161,7 +163,7 @@ impl<T: Send + Sync + 'static> Task<T> {
                 }
                 Some(()) = changed.recv() => quiet(&mut changed, settings.debounce).await,
                 () = hangup.recv() => forced = true,
-                // The first tick comes at once: what changed since the first reading is found.
+                () = async {}, if is_first => is_first = false,
                 _ = poll.tick() => {}
             }
             let sources = self.composition.sources().clone();

@@ -25,6 +25,7 @@ const AFTER_MAIN: Duration = Duration::from_millis(500);
 /// Runs the main future of the process `name` on a runtime of its own; what then still blocks a
 /// thread does not hold it up. A system that gives no threads is told on stderr.
 pub fn block_on(name: &str, main: impl Future<Output = ExitCode>) -> ExitCode {
+    crate::ticks::begin();
     match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => {
             let code = runtime.block_on(main);

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use blaze_proto::v1;
+use blaze_runtime::on_beat;
 use bytes::Bytes;
 use tokio::time::Instant;
 
@@ -100,7 +101,7 @@ impl Engine {
 
     /// Looks whether anything has run out.
     pub(super) fn look_at_signs(&mut self) {
-        self.look_at = Instant::now() + LOOK;
+        self.look_at = on_beat(Instant::now() + LOOK);
         let complaints = self.signs.expire(Instant::now().into_std());
         self.judge(&complaints);
     }

@@ -32,6 +32,7 @@ use std::time::Duration;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Kind, Timestamp};
 use blaze_proto::v1;
+use blaze_runtime::on_beat;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
@@ -134,7 +135,7 @@ impl Engine {
             texts_until: None,
             signs: Signs::new(identity.site.clone()),
             gate: Gate::default(),
-            look_at: now + LOOK,
+            look_at: on_beat(now + LOOK),
             stream: None,
             reason: None,
             beside: follow::Beside::default(),

@@ -27,6 +27,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_brokers::redis::RedisLock;
+use blaze_runtime::{BEAT, on_beat};
 use tokio::time::Instant;
 
 #[cfg(feature = "kafka")]
@@ -96,6 +97,8 @@ pub async fn keep(lease: Arc<dyn Lease>, time: Duration, holder: &mut Holder) {
         }
         holder.lead(until);
         let next = asked + if until.is_some() { renew } else { look };
+        // Short leases have no room for that.
+        let next = if look >= BEAT { on_beat(next) } else { next };
         match until.filter(|until| *until < next) {
             Some(over) => {
                 tokio::time::sleep_until(over).await;
