@@ -1,6 +1,5 @@
 //! From the node file to a broker.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use blaze_domain::node_file::{CacheSection, Fault, LayerBroker, NodeBroker, NodeFile};
@@ -33,20 +32,6 @@ pub enum OpenError {
     /// It has no server: it lives inside the process that opens it.
     #[error("memory: {{}} lives inside one process; other processes need a server")]
     InProcess,
-}
-
-/// The password that a file holds, without the end of its line. A file that is empty is one that is
-/// just being written.
-///
-/// # Errors
-/// For people, with the file's name.
-pub(crate) fn read_password(path: &Path) -> Result<String, String> {
-    let text =
-        std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
-    match text.trim_end_matches(['\r', '\n']) {
-        "" => Err(format!("{}: it is empty", path.display())),
-        password => Ok(password.to_owned()),
-    }
 }
 
 /// The node file as a program with brokers reads it: with what the adapters have against its

@@ -11,10 +11,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use blaze_domain::node_file::{ControlPlaneSection, StoreSection};
+use blaze_domain::node_file::{ControlPlaneSection, MongoSection, StoreSection};
 use blaze_runtime::admin::say_listening;
 use blaze_runtime::supervisor::{ShutdownSteps, Supervisor, TaskPolicy, failed};
-use blaze_runtime::{ready_line, say};
+use blaze_runtime::{read_password, ready_line, say};
 
 use crate::auth::Authenticator;
 use crate::auth::startup::check_startup;
@@ -65,14 +65,19 @@ impl Setup {
     /// Every reason, one a line.
     pub fn check(&self) -> Result<(), Vec<String>> {
         let mut faults = check_startup(&self.section, self.dev).err().unwrap_or_default();
-        if cfg!(not(feature = "mongodb"))
-            && matches!(self.section.store, StoreSection::MongoDb { .. })
+        if cfg!(not(feature = "mongodb")) && matches!(self.section.store, StoreSection::MongoDb(_))
         {
             faults.push(
                 "control_plane.store.mongodb: this program was built without MongoDB (cargo \
                  feature `mongodb`)"
                     .to_owned(),
             );
+        }
+        if let StoreSection::MongoDb(MongoSection { password_file: Some(file), .. }) =
+            &self.section.store
+            && let Err(fault) = read_password(file)
+        {
+            faults.push(format!("control_plane.store.mongodb.password_file: {fault}"));
         }
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
@@ -311,6 +316,10 @@ mod tests {
         section.tls.cert_file = Some(path("nope.pem"));
         section.tls.key_file = Some(path("nope.pem"));
         section.tls.client_ca_file = Some(path("nope.ca"));
+        section.store = StoreSection::MongoDb(MongoSection {
+            password_file: Some(path("nope.pw")),
+            ..MongoSection::of("mongodb://me@h", "x")
+        });
         let found = setup(section).check_all().unwrap_err();
         for (place, part) in [
             ("control_plane.auth.issuer: ", "empty"),
@@ -322,12 +331,13 @@ mod tests {
             ("control_plane.tls.cert_file: ", "nope.pem cannot be read"),
             ("control_plane.tls.key_file: ", "nope.pem cannot be read"),
             ("control_plane.tls.client_ca_file: ", "nope.ca cannot be read"),
+            ("control_plane.store.mongodb.password_file: ", "nope.pw: No such file"),
         ] {
             let matching =
                 found.iter().filter(|fault| fault.starts_with(place) && fault.contains(part));
             assert_eq!(matching.count(), 1, "{place}{part} in {found:#?}");
         }
-        assert_eq!(found.len(), 9, "{found:#?}");
+        assert_eq!(found.len(), 10, "{found:#?}");
     }
 
     #[test]

@@ -10,6 +10,7 @@ pub mod config;
 mod core_dumps;
 pub mod environment;
 pub mod logs;
+mod password;
 mod ready;
 pub mod state;
 pub mod supervisor;
@@ -17,6 +18,7 @@ mod ticks;
 
 pub use admin::{AdminServer, CheckStatus, Gate, Readiness};
 pub use core_dumps::forbid_core_dumps;
+pub use password::read_password;
 pub use ready::ready_line;
 pub use supervisor::{
     ShutdownPhase, ShutdownReport, ShutdownSteps, Signals, StopOnDrop, Supervisor, TaskEnd,

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use blaze_domain::node_file::DatabaseSection;
+use blaze_domain::node_file::{DatabaseSection, MongoSection};
 
 use crate::copy::{FileCopy, LocalCopy, Vault};
 use crate::settings::WorkerSettings;
@@ -24,9 +24,8 @@ pub(crate) async fn open(
     let layer = &settings.site.layer;
     let (folder, database) = match &settings.database {
         Some(DatabaseSection::Embedded { path }) => (Some(path.clone()), None),
-        Some(DatabaseSection::MongoDb { uri, database }) => {
-            let copy =
-                mongodb(uri.clone(), database, settings, vault).context("database.mongodb")?;
+        Some(DatabaseSection::MongoDb(section)) => {
+            let copy = mongodb(section.clone(), settings, vault).context("database.mongodb")?;
             (folder, Some(copy))
         }
         None => (folder, None),
@@ -41,20 +40,18 @@ pub(crate) async fn open(
 
 #[cfg(feature = "mongodb")]
 fn mongodb(
-    uri: blaze_domain::node_file::SecretText,
-    database: &str,
+    section: MongoSection,
     settings: &WorkerSettings,
     vault: &Vault,
 ) -> anyhow::Result<Arc<dyn LocalCopy>> {
     let (layer, node) = (settings.site.layer.clone(), settings.site.node.as_ref());
-    let copy = crate::copy::MongoCopy::new(uri, database, layer, node, vault.clone())?;
+    let copy = crate::copy::MongoCopy::new(section, layer, node, vault.clone())?;
     Ok(Arc::new(copy))
 }
 
 #[cfg(not(feature = "mongodb"))]
 fn mongodb(
-    _uri: blaze_domain::node_file::SecretText,
-    _database: &str,
+    _section: MongoSection,
     _settings: &WorkerSettings,
     _vault: &Vault,
 ) -> anyhow::Result<Arc<dyn LocalCopy>> {

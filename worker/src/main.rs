@@ -10,7 +10,7 @@ use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, Role, node_schema, open_layer, open_node};
 use blaze_domain::InstanceName;
-use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
+use blaze_domain::node_file::{DatabaseSection, Fault, LayerBroker, NodeBroker, NodeFile};
 use blaze_runtime::admin::{Readiness, say_listening};
 use blaze_runtime::config::{
     Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_or_say,
@@ -20,7 +20,7 @@ use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{
     ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, failed,
 };
-use blaze_runtime::{environment, forbid_core_dumps, logs, ready_line, say, state};
+use blaze_runtime::{environment, forbid_core_dumps, logs, read_password, ready_line, say, state};
 use blaze_worker::admin::Shown;
 use blaze_worker::copy::Vault;
 use blaze_worker::lease;
@@ -65,7 +65,7 @@ fn main() -> ExitCode {
         Ok(instance) => (instance.unwrap_or_else(InstanceName::first), None),
         Err(fault) => (InstanceName::first(), Some(fault)),
     };
-    let loaded = match load_or_say(&sources, &schema(), fault) {
+    let loaded = match load_or_say(&sources, &schema(true), fault) {
         Ok(loaded) => loaded,
         Err(code) => return code,
     };
@@ -75,10 +75,17 @@ fn main() -> ExitCode {
     block_on(NAME, run(sources.pinned(), loaded, instance))
 }
 
-/// The node file as this program reads it.
-fn schema() -> Schema<NodeFile> {
-    node_schema(|file| {
+/// The node file as this program reads it. A password file is looked at only `at_start`: later it
+/// may be about to be replaced, which says nothing against what else has changed.
+fn schema(at_start: bool) -> Schema<NodeFile> {
+    node_schema(move |file| {
         let mut faults = WorkerSettings::of(file).err().unwrap_or_default();
+        if at_start
+            && let Some(DatabaseSection::MongoDb(section)) = &file.database
+            && let Some(Err(detail)) = section.password_file.as_deref().map(read_password)
+        {
+            faults.push(Fault { path: "database.mongodb.password_file".to_owned(), detail });
+        }
         let key = Vault::load(file.worker.key_file.as_deref());
         faults.extend(key.err().map(|error| Fault {
             path: "worker.key_file".to_owned(),
@@ -122,7 +129,7 @@ async fn start(
     shown.set(Arc::clone(&worker));
     let overlays = worker.own().overlays();
     let told =
-        watch_with(supervisor, sources, schema(), loaded, WatchSettings::default(), overlays);
+        watch_with(supervisor, sources, schema(false), loaded, WatchSettings::default(), overlays);
     let follow = follow_node_file(Arc::clone(&worker), told, log, readiness.clone());
     supervisor.spawn("reload", TaskPolicy::Essential, follow);
     let stop = supervisor.stopping_token();

@@ -6,13 +6,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_domain::node_file::KafkaBroker as Section;
+use blaze_runtime::read_password;
 use parking_lot::Mutex;
 use rdkafka::ClientConfig;
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::KafkaError;
 use rdkafka::producer::BaseProducer;
 
-use crate::open::{OpenError, read_password};
+use crate::open::OpenError;
 
 /// Largest record, in bytes: the largest payload, and a mebibyte for everything around it.
 const MESSAGE_MAX_BYTES: &str = "17825792";

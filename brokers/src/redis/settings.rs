@@ -5,10 +5,11 @@ use std::time::Duration;
 
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::RedisBroker as Section;
+use blaze_runtime::read_password;
 use redis::io::tcp::TcpSettings;
 use redis::{ConnectionInfo, IntoConnectionInfo, ProtocolVersion};
 
-use crate::open::{OpenError, read_password};
+use crate::open::OpenError;
 
 /// After this time without a sign from the other host a connection is dead.
 const USER_TIMEOUT: Duration = Duration::from_secs(10);

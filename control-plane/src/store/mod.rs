@@ -27,7 +27,7 @@ pub mod upkeep;
 use std::sync::Arc;
 
 use blaze_domain::node_file::StoreSection;
-use blaze_runtime::supervisor::Supervisor;
+use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
 use tokio::sync::mpsc;
 
 #[cfg(feature = "mongodb")]
@@ -73,11 +73,21 @@ pub async fn open_with(
             Ok(Arc::new(SqliteStore::open_with(path, migrations, supervisor).await?))
         }
         #[cfg(feature = "mongodb")]
-        StoreSection::MongoDb { uri, database } => {
-            Ok(Arc::new(MongoStore::open_with(uri.reveal(), database, migrations).await?))
+        StoreSection::MongoDb(section) => {
+            let store = Arc::new(MongoStore::open_with(section, migrations).await?);
+            if section.password_file.is_some() {
+                let (store, stop) = (Arc::clone(&store), supervisor.shutdown_token());
+                supervisor.spawn("password of MongoDB", TaskPolicy::Essential, async move {
+                    tokio::select! {
+                        () = store.follow_password() => {}
+                        () = stop.cancelled() => {}
+                    }
+                });
+            }
+            Ok(store)
         }
         #[cfg(not(feature = "mongodb"))]
-        StoreSection::MongoDb { .. } => Err(without_mongodb()),
+        StoreSection::MongoDb(_) => Err(without_mongodb()),
     }
 }
 
@@ -98,11 +108,9 @@ pub async fn plan(section: &StoreSection) -> Result<Plan, StoreError> {
     match section {
         StoreSection::Sqlite { path } => SqliteStore::plan(path, &migrations).await,
         #[cfg(feature = "mongodb")]
-        StoreSection::MongoDb { uri, database } => {
-            MongoStore::plan(uri.reveal(), database, &migrations).await
-        }
+        StoreSection::MongoDb(section) => MongoStore::plan(section, &migrations).await,
         #[cfg(not(feature = "mongodb"))]
-        StoreSection::MongoDb { .. } => Err(without_mongodb()),
+        StoreSection::MongoDb(_) => Err(without_mongodb()),
     }
 }
 
@@ -118,11 +126,9 @@ pub async fn export(
     match section {
         StoreSection::Sqlite { path } => SqliteStore::export_beside(path, supervisor, pieces).await,
         #[cfg(feature = "mongodb")]
-        StoreSection::MongoDb { uri, database } => {
-            MongoStore::export_beside(uri.reveal(), database, pieces).await
-        }
+        StoreSection::MongoDb(section) => MongoStore::export_beside(section, pieces).await,
         #[cfg(not(feature = "mongodb"))]
-        StoreSection::MongoDb { .. } => Err(without_mongodb()),
+        StoreSection::MongoDb(_) => Err(without_mongodb()),
     }
 }
 

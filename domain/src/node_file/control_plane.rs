@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use super::readers::{boolean, parsed, path, text, whole};
-use super::services::{loopback, mongodb, socket};
+use super::services::{MongoSection, loopback, socket};
 use super::walk::{Node, Section, from_empty};
 use super::{SecretText, url};
 use crate::qos::word_enum;
@@ -118,12 +118,7 @@ pub enum StoreSection {
         path: PathBuf,
     },
     /// A MongoDB replica set.
-    MongoDb {
-        /// `mongodb://` or `mongodb+srv://`.
-        uri: SecretText,
-        /// Name of the database.
-        database: String,
-    },
+    MongoDb(MongoSection),
 }
 
 impl Default for StoreSection {
@@ -138,10 +133,7 @@ impl StoreSection {
             ("sqlite", |s| {
                 Some(Self::Sqlite { path: s.or("path", path, PathBuf::from("./blaze-config.db")) })
             }),
-            ("mongodb", |s| {
-                let (uri, database) = mongodb(s, "blaze_main")?;
-                Some(Self::MongoDb { uri, database })
-            }),
+            ("mongodb", |s| MongoSection::section(s, "blaze_main").map(Self::MongoDb)),
         ])
     }
 }

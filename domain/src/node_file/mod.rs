@@ -47,7 +47,7 @@ pub use pattern::{PatternError, TopicPattern};
 pub use plan_file::{FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedLane, PlannedTopic};
 pub use services::{
     AdminSection, CacheSection, ConfigSection, DatabaseSection, LogFormat, LogSection,
-    MonitorSection, WorkerSection,
+    MongoSection, MonitorSection, WorkerSection,
 };
 
 use crate::MAX_PAYLOAD_BYTES;

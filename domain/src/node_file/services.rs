@@ -91,12 +91,7 @@ impl CacheSection {
 #[derive(Debug, Clone, PartialEq)]
 pub enum DatabaseSection {
     /// A MongoDB server.
-    MongoDb {
-        /// `mongodb://` or `mongodb+srv://`.
-        uri: SecretText,
-        /// Name of the database.
-        database: String,
-    },
+    MongoDb(MongoSection),
     /// A directory of this machine.
     Embedded {
         /// Which one.
@@ -107,19 +102,66 @@ pub enum DatabaseSection {
 impl DatabaseSection {
     pub(super) fn section(s: &mut Section<'_>) -> Option<Self> {
         s.one_of(&[
-            ("mongodb", |s| {
-                let (uri, database) = mongodb(s, "blaze")?;
-                Some(Self::MongoDb { uri, database })
-            }),
+            ("mongodb", |s| MongoSection::section(s, "blaze").map(Self::MongoDb)),
             ("embedded", |s| Some(Self::Embedded { path: s.need("path", path)? })),
         ])
     }
 }
 
-pub(super) fn mongodb(s: &mut Section<'_>, default: &str) -> Option<(SecretText, String)> {
-    let uri = s.need("uri", url(&["mongodb://", "mongodb+srv://"]));
-    let database = s.or("database", text, default.to_owned());
-    Some((uri?, database))
+/// A database of MongoDB.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MongoSection {
+    /// `mongodb://` or `mongodb+srv://`.
+    pub uri: SecretText,
+    /// Name of the database.
+    pub database: String,
+    /// File with the password of the URI's user, if that is not in the URI.
+    pub password_file: Option<PathBuf>,
+}
+
+impl MongoSection {
+    /// A database, with what the URI says alone.
+    #[must_use]
+    pub fn of(uri: &str, database: &str) -> Self {
+        Self { uri: uri.to_owned().into(), database: database.to_owned(), password_file: None }
+    }
+
+    /// The URI with a password for its user, if there is one.
+    #[must_use]
+    pub fn uri_with(&self, password: Option<&SecretText>) -> SecretText {
+        let uri = self.uri.reveal();
+        let (Some(password), Some((user, hosts))) = (password, uri.split_once('@')) else {
+            return self.uri.clone();
+        };
+        let mut out = format!("{user}:");
+        for byte in password.reveal().bytes() {
+            match byte.is_ascii_alphanumeric() {
+                true => out.push(char::from(byte)),
+                false => out.push_str(&format!("%{byte:02X}")),
+            }
+        }
+        format!("{out}@{hosts}").into()
+    }
+
+    pub(super) fn section(s: &mut Section<'_>, default: &str) -> Option<Self> {
+        let uri: Option<SecretText> = s.need("uri", url(&["mongodb://", "mongodb+srv://"]));
+        let database = s.or("database", text, default.to_owned());
+        let password_file = s.opt("password_file", path);
+        let uri = uri?;
+        if password_file.is_some() && !names_user_alone(uri.reveal()) {
+            return s.node.fault(
+                "password_file needs a uri with a user and without a password: mongodb://USER@HOST",
+            );
+        }
+        Some(Self { uri, database, password_file })
+    }
+}
+
+/// Whether a URI has a user and no password.
+fn names_user_alone(uri: &str) -> bool {
+    let place = uri.split_once("://").map_or(uri, |(_, place)| place);
+    let hosts = place.split(['/', '?']).next().unwrap_or_default();
+    hosts.rsplit_once('@').is_some_and(|(user, _)| !user.is_empty() && !user.contains(':'))
 }
 
 /// `monitor`.

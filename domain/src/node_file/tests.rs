@@ -263,6 +263,26 @@ fn a_password_of_kafka_stands_in_one_place() {
 }
 
 #[test]
+fn a_password_of_mongodb_belongs_to_a_user_of_the_uri() {
+    let tree = |uri: &str| {
+        let store = json!({ "mongodb": { "uri": uri, "password_file": "/f" } });
+        json!({ "control_plane": { "store": store }, "database": store })
+    };
+    for uri in ["mongodb://me@h", "mongodb://me@h:1,i:2/?x=y@z", "mongodb+srv://a%40b@h.example"] {
+        let (file, _) = NodeFile::read(&tree(uri)).unwrap();
+        let Some(DatabaseSection::MongoDb(section)) = file.database else { panic!("{uri}") };
+        let whole = section.uri_with(Some(&"p@:/%ä".to_owned().into()));
+        assert_eq!(whole.reveal(), uri.replacen('@', ":p%40%3A%2F%25%C3%A4@", 1));
+        assert_eq!(section.uri_with(None).reveal(), uri);
+    }
+    for uri in ["mongodb://h:1", "mongodb://me:geheim@h", "mongodb://@h", "mongodb://h/?x=a@b"] {
+        let found = faults(&tree(uri));
+        assert!(found.len() == 2 && !found[0].contains("geheim"), "{uri}: {found:?}");
+        assert!(found.iter().all(|fault| fault.contains("mongodb://USER@HOST")), "{found:?}");
+    }
+}
+
+#[test]
 fn the_first_rule_that_gives_a_value_wins() {
     let tree = json!({ "flow": { "compression": { "level": 3 }, "topics": [
         { "match": "camera/*", "max_rate_hz": 15, "compression": { "level": 9 } },

@@ -4,6 +4,8 @@
 use std::sync::Arc;
 
 use blaze_domain::LayerName;
+#[cfg(feature = "mongodb")]
+use blaze_domain::node_file::MongoSection;
 use serde_json::json;
 use tempfile::TempDir;
 use tokio::runtime::Runtime;
@@ -45,7 +47,7 @@ impl Subject {
             Kind::File => Box::new(FileCopy::new(self.folder.path(), layer, vault)),
             #[cfg(feature = "mongodb")]
             Kind::Mongo { uri, database } => Box::new(
-                super::MongoCopy::new(uri.clone().into(), database, layer, None, vault).unwrap(),
+                super::MongoCopy::new(MongoSection::of(uri, database), layer, None, vault).unwrap(),
             ),
         }
     }
@@ -208,9 +210,13 @@ mod in_mongodb {
                 [(5, Vault::default(), true), (6, Vault::with_key([7; 32]), false)]
             {
                 let layer = "edge".parse().unwrap();
-                let copy =
-                    crate::copy::MongoCopy::new(uri.clone().into(), database, layer, None, vault)
-                        .unwrap();
+                let copy = crate::copy::MongoCopy::new(
+                    MongoSection::of(uri, database),
+                    layer,
+                    None,
+                    vault,
+                )
+                .unwrap();
                 copy.replace(&sample(revision)).await.unwrap();
                 let head = tables.collection::<Document>("head").find_one(doc! {}).await.unwrap();
                 let chunks = tables.collection::<Document>("chunks").find(doc! {}).await.unwrap();

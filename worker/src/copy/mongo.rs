@@ -17,7 +17,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use async_trait::async_trait;
 use blaze_domain::config::Timestamp;
-use blaze_domain::node_file::SecretText;
+use blaze_domain::node_file::MongoSection;
 use blaze_domain::{LayerName, NodeName};
 use futures::TryStreamExt as _;
 use mongodb::bson::spec::BinarySubtype;
@@ -52,8 +52,7 @@ impl MongoCopy {
     /// # Errors
     /// [`CopyError::Refused`] for a name that no database can have.
     pub fn new(
-        uri: SecretText,
-        database: &str,
+        section: MongoSection,
         layer: LayerName,
         node: Option<&NodeName>,
         vault: Vault,
@@ -61,9 +60,9 @@ impl MongoCopy {
         // Names have no dot and no slash: no two copies have one name, and no name begins as the
         // chunks of another copy do.
         let copy = node.map_or_else(|| layer.to_string(), |node| format!("{layer}.{node}"));
-        let place = format!("MongoDB {database}, copy {copy}");
+        let place = format!("MongoDB {}, copy {copy}", section.database);
         Ok(Self {
-            server: Server::new(uri, database, &copy, &place)?,
+            server: Server::new(section, &copy, &place)?,
             place,
             copy,
             layer,

@@ -1,16 +1,20 @@
 //! The connection to MongoDB: made at the first use, and limited in everything.
 
 use std::future::IntoFuture;
+use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::node_file::SecretText;
-use mongodb::bson::Document;
+use blaze_domain::node_file::{MongoSection, SecretText};
+use blaze_runtime::read_password;
+use mongodb::bson::{Document, doc};
 use mongodb::error::{Error, ErrorKind, WriteFailure};
 use mongodb::options::{
     ClientOptions, DatabaseOptions, ReadPreference, SelectionCriteria, WriteConcern,
 };
 use mongodb::{Client, Collection};
 use tokio::sync::Mutex;
+use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 use super::CopyError;
 
@@ -18,6 +22,8 @@ use super::CopyError;
 const SELECTION: Duration = Duration::from_secs(2);
 /// Each operation.
 const OPERATION: Duration = Duration::from_secs(5);
+/// Between two tries to log in with another password.
+const LOG_IN_AGAIN: Duration = Duration::from_secs(1);
 /// Most connections: one who writes, one who reads.
 const CONNECTIONS: u32 = 4;
 /// Longest name of a database.
@@ -27,12 +33,59 @@ const DUPLICATE_KEY: i32 = 11_000;
 const NEVER: [i32; 3] = [13, 18, 59];
 
 /// Where the copy is.
+#[derive(Clone)]
 pub(crate) struct Server {
-    uri: SecretText,
-    database: String,
+    section: MongoSection,
     app_name: String,
     place: String,
-    tables: Mutex<Option<Tables>>,
+    connected: Arc<Mutex<Option<Connected>>>,
+}
+
+/// The collections of a client, and what it logs in with where that is not in the URI.
+type LoggedIn = (Tables, Option<SecretText>);
+
+/// The client that serves.
+struct Connected {
+    tables: Tables,
+    password: Option<SecretText>,
+    /// One that logs in with another password.
+    trying: JoinSet<Result<LoggedIn, CopyError>>,
+    /// When that is tried next, at the earliest.
+    again: Instant,
+    /// Whether it was said that it does not work.
+    is_told: bool,
+}
+
+impl Connected {
+    /// Takes over a client that the server has let in; begins to try one, if the file holds
+    /// another password.
+    fn follow(&mut self, server: &Server, password: Result<Option<SecretText>, CopyError>) {
+        match self.trying.try_join_next() {
+            Some(Ok(Ok((tables, password)))) => {
+                (self.tables, self.password, self.is_told) = (tables, password, false);
+                tracing::info!(place = server.place, "logged in with another password");
+            }
+            Some(Ok(Err(error))) => self.tell(&error),
+            // The second: the runtime goes away.
+            None | Some(Err(_)) => {}
+        }
+        let now = Instant::now();
+        match password {
+            Ok(password) => {
+                if password != self.password && self.trying.is_empty() && self.again <= now {
+                    self.again = now + LOG_IN_AGAIN;
+                    self.trying.spawn(server.clone().log_in(password));
+                }
+            }
+            Err(error) => self.tell(&error),
+        }
+    }
+
+    fn tell(&mut self, error: &CopyError) {
+        if !std::mem::replace(&mut self.is_told, true) {
+            tracing::warn!(%error, "the password of MongoDB that the file holds is not used");
+        }
+    }
 }
 
 /// Its collections. Writes count once a majority has them on disk; a server that is alone is its
@@ -49,12 +102,8 @@ impl Server {
     ///
     /// # Errors
     /// [`CopyError::Refused`] for a name that no database can have.
-    pub(crate) fn new(
-        uri: SecretText,
-        database: &str,
-        copy: &str,
-        place: &str,
-    ) -> Result<Self, CopyError> {
+    pub(crate) fn new(section: MongoSection, copy: &str, place: &str) -> Result<Self, CopyError> {
+        let database = &section.database;
         let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
         if database.is_empty() || database.len() > NAME_BYTES || !database.chars().all(allowed) {
             return Err(CopyError::Refused {
@@ -66,24 +115,54 @@ impl Server {
             });
         }
         Ok(Self {
-            uri,
-            database: database.to_owned(),
+            section,
             app_name: format!("blaze-worker/{copy}"),
             place: place.to_owned(),
-            tables: Mutex::new(None),
+            connected: Arc::default(),
         })
     }
 
-    /// The collections.
+    /// The collections. Where the file holds another password, a client that logs in with it is
+    /// tried beside; until the server takes it, the one of before serves.
     ///
     /// # Errors
     /// [`CopyError::Refused`], [`CopyError::Away`].
     pub(crate) async fn tables(&self) -> Result<Tables, CopyError> {
-        let mut held = self.tables.lock().await;
-        if let Some(tables) = &*held {
-            return Ok(tables.clone());
+        let password = self.password().await;
+        let mut held = self.connected.lock().await;
+        if let Some(before) = &mut *held {
+            before.follow(self, password);
+            return Ok(before.tables.clone());
         }
-        let mut options = self.limited(ClientOptions::parse(self.uri.reveal())).await?;
+        let password = password?;
+        let tables = self.connect(password.as_ref()).await?;
+        let (again, is_told, trying) = (Instant::now(), false, JoinSet::new());
+        *held = Some(Connected { tables: tables.clone(), password, trying, again, is_told });
+        Ok(tables)
+    }
+
+    /// A client that the server has let in.
+    async fn log_in(self, password: Option<SecretText>) -> Result<LoggedIn, CopyError> {
+        let tables = self.connect(password.as_ref()).await?;
+        let database = tables.head.client().database("admin");
+        self.limited(database.run_command(doc! { "ping": 1 })).await?;
+        Ok((tables, password))
+    }
+
+    async fn password(&self) -> Result<Option<SecretText>, CopyError> {
+        let Some(file) = self.section.password_file.clone() else {
+            return Ok(None);
+        };
+        let read = tokio::task::spawn_blocking(move || read_password(&file)).await;
+        let away = |detail| CopyError::Away { place: self.place.clone(), detail };
+        // The blocking task ends early only when the runtime goes away.
+        let password = read.unwrap_or_else(|error| Err(error.to_string())).map_err(away)?;
+        Ok(Some(password.into()))
+    }
+
+    async fn connect(&self, password: Option<&SecretText>) -> Result<Tables, CopyError> {
+        let uri = self.section.uri_with(password);
+        let mut options = self.limited(ClientOptions::parse(uri.reveal())).await?;
         options.app_name = Some(self.app_name.clone());
         options.server_selection_timeout = Some(SELECTION);
         options.connect_timeout = Some(SELECTION);
@@ -100,13 +179,12 @@ impl Server {
             .write_concern(durable)
             .selection_criteria(SelectionCriteria::ReadPreference(ReadPreference::Primary))
             .build();
-        let database = client.database_with_options(&self.database, options);
-        let tables = Tables {
+        let database = client.database_with_options(&self.section.database, options);
+        Ok(Tables {
             head: database.collection("head"),
             chunks: database.collection("chunks"),
             leases: database.collection("leases"),
-        };
-        Ok(held.insert(tables).clone())
+        })
     }
 
     /// Waits for the driver, which has no limit of its own once a request is sent.

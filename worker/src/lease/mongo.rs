@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_domain::LayerName;
-use blaze_domain::node_file::SecretText;
+use blaze_domain::node_file::MongoSection;
 use mongodb::bson::{Bson, DateTime, Document, doc};
 use mongodb::options::ReturnDocument;
 
@@ -32,14 +32,9 @@ impl MongoLease {
     ///
     /// # Errors
     /// [`CopyError::Refused`] for a name that no database can have.
-    pub fn new(
-        uri: SecretText,
-        database: &str,
-        layer: LayerName,
-        owner: String,
-    ) -> Result<Self, CopyError> {
-        let place = format!("MongoDB {database}, lease {layer}");
-        Ok(Self { server: Server::new(uri, database, "lease", &place)?, place, layer, owner })
+    pub fn new(section: MongoSection, layer: LayerName, owner: String) -> Result<Self, CopyError> {
+        let place = format!("MongoDB {}, lease {layer}", section.database);
+        Ok(Self { server: Server::new(section, "lease", &place)?, place, layer, owner })
     }
 }
 

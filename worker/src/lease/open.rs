@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use anyhow::Context as _;
 use blaze_brokers::redis::RedisKeys;
 use blaze_domain::LayerName;
-use blaze_domain::node_file::{DatabaseSection, KafkaBroker, LayerBroker, SecretText};
+use blaze_domain::node_file::{DatabaseSection, KafkaBroker, LayerBroker, MongoSection};
 
 use super::{Lease, RedisLease};
 use crate::settings::{LocalBroker, WorkerSettings};
@@ -30,8 +30,8 @@ pub fn open(
         (LocalBroker::Layer(broker), _) => broker,
     };
     let lease = match (&settings.database, keys, broker) {
-        (Some(DatabaseSection::MongoDb { uri, database }), _, _) => {
-            mongodb(uri, database, layer, worker_id).context("database.mongodb")?
+        (Some(DatabaseSection::MongoDb(section)), _, _) => {
+            mongodb(section, layer, worker_id).context("database.mongodb")?
         }
         (_, Some(keys), _) => {
             Arc::new(RedisLease::new(Arc::clone(keys), layer, worker_id.to_owned()))
@@ -60,19 +60,17 @@ fn of_node(settings: &WorkerSettings, keys: &Arc<RedisKeys>, worker_id: &str) ->
 
 #[cfg(feature = "mongodb")]
 fn mongodb(
-    uri: &SecretText,
-    database: &str,
+    section: &MongoSection,
     layer: &LayerName,
     owner: &str,
 ) -> anyhow::Result<Arc<dyn Lease>> {
-    let lease = super::MongoLease::new(uri.clone(), database, layer.clone(), owner.to_owned())?;
+    let lease = super::MongoLease::new(section.clone(), layer.clone(), owner.to_owned())?;
     Ok(Arc::new(lease))
 }
 
 #[cfg(not(feature = "mongodb"))]
 fn mongodb(
-    _uri: &SecretText,
-    _database: &str,
+    _section: &MongoSection,
     _layer: &LayerName,
     _owner: &str,
 ) -> anyhow::Result<Arc<dyn Lease>> {

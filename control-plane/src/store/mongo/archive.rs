@@ -33,13 +33,13 @@ impl MongoStore {
         below: Option<u64>,
         limit: usize,
     ) -> Result<Vec<Version>, StoreError> {
+        let tables = self.tables();
         if limit == 0 {
             return Ok(Vec::new());
         }
         let (key, below) = (key.to_string(), below.map_or(i64::MAX, signed));
         let matching = doc! { "docs.key": &key, "_id": { "$lt": below } };
-        let find = self
-            .tables
+        let find = tables
             .events
             .find(matching)
             .sort(doc! { "_id": -1 })
@@ -50,7 +50,7 @@ impl MongoStore {
         let records = collect(find, rows::read_record).await?;
         let floor = signed(self.read_floor().await?);
         let kept = rows::versions_below(&key, below);
-        let kept = self.tables.versions.find(kept).sort(doc! { "_id": -1 }).limit(limit_of(limit));
+        let kept = tables.versions.find(kept).sort(doc! { "_id": -1 }).limit(limit_of(limit));
         let kept = collect(kept, rows::read_version).await?;
         let logged = records.into_iter().flat_map(|record| record.versions);
         let logged = logged.filter(|row| row.revision > floor && row.revision < below);
@@ -95,6 +95,7 @@ impl MongoStore {
         after: i64,
         until: i64,
     ) -> Result<BTreeMap<String, (i64, Option<i64>)>, StoreError> {
+        let tables = self.tables();
         let mut first: BTreeMap<String, (i64, Option<i64>)> = BTreeMap::new();
         // There may be many more changes than documents, so they are not collected before.
         let mut note = |key: &str, changed: i64, previous: Option<i64>| {
@@ -114,7 +115,7 @@ impl MongoStore {
             "last": { "$gt": after },
         };
         let fields = doc! { "docs.key": 1, "docs.revision": 1, "docs.previous": 1 };
-        let logged = self.tables.events.find(range).projection(fields);
+        let logged = tables.events.find(range).projection(fields);
         collect(logged, |found| {
             for change in rows::members(found, "docs") {
                 let change = change?;
@@ -126,7 +127,7 @@ impl MongoStore {
         .await?;
         let range = doc! { "revision": { "$gt": after, "$lte": until } };
         let fields = doc! { "_id": 1, "previous": 1 };
-        let kept = self.tables.versions.find(range).projection(fields);
+        let kept = tables.versions.find(range).projection(fields);
         collect(kept, |found| {
             let id = rows::text(found, "_id")?;
             let (key, revision) = rows::split_version_id(&id)?;
@@ -173,8 +174,9 @@ impl MongoStore {
         wanted: &BTreeMap<&str, i64>,
         texts: &mut BTreeMap<String, String>,
     ) -> Result<(), StoreError> {
+        let tables = self.tables();
         let revisions: BTreeSet<i64> = wanted.values().copied().collect();
-        let find = self.tables.events.find(matching).projection(doc! { "audit": 0, "answers": 0 });
+        let find = tables.events.find(matching).projection(doc! { "audit": 0, "answers": 0 });
         let logged = collect(find, |found| {
             let mut versions = rows::read_record(found)?.versions;
             versions.retain(|row| revisions.contains(&row.revision));
@@ -190,11 +192,12 @@ impl MongoStore {
         wanted: &BTreeMap<&str, i64>,
         texts: &mut BTreeMap<String, String>,
     ) -> Result<(), StoreError> {
+        let tables = self.tables();
         let ids = some.iter().filter(|(key, _)| !texts.contains_key(*key));
         let ids: Vec<String> =
             ids.map(|(key, revision)| rows::version_id(key, *revision)).collect();
         if !ids.is_empty() {
-            let kept = self.tables.versions.find(doc! { "_id": { "$in": ids } });
+            let kept = tables.versions.find(doc! { "_id": { "$in": ids } });
             keep_wanted(collect(kept, rows::read_version).await?, wanted, texts);
         }
         Ok(())
@@ -202,12 +205,12 @@ impl MongoStore {
 
     /// Times rise with revisions, but for the differences of the processes' clocks.
     pub(super) async fn find_revision_before(&self, time: Timestamp) -> Result<u64, StoreError> {
+        let tables = self.tables();
         let floor = signed(self.read_floor().await?);
         let (mut before, mut after) = (floor, signed(self.read_head().await?) + 1);
         while after - before > 1 {
             let middle = before + (after - before) / 2;
-            let find = self
-                .tables
+            let find = tables
                 .events
                 .find_one(doc! { "_id": { "$lte": middle } })
                 .sort(doc! { "_id": -1 })
@@ -232,6 +235,7 @@ impl MongoStore {
     }
 
     pub(super) async fn write_audit(&self, entries: &[AuditEntry]) -> Result<(), StoreError> {
+        let tables = self.tables();
         let entries: Vec<Document> = entries
             .iter()
             .map(|entry| Ok(rows::audit(&AuditRow::encode(entry)?)))
@@ -241,7 +245,7 @@ impl MongoStore {
         }
         // Unordered, so that those that are there already do not keep out the others.
         let insert = async {
-            match self.tables.audit.insert_many(entries).ordered(false).await {
+            match tables.audit.insert_many(entries).ordered(false).await {
                 Err(error) if !is_duplicate(&error) => Err(error),
                 Ok(_) | Err(_) => Ok(()),
             }
@@ -253,14 +257,14 @@ impl MongoStore {
         &self,
         query: &AuditQuery,
     ) -> Result<Vec<AuditEntry>, StoreError> {
+        let tables = self.tables();
         if query.limit == 0 {
             return Ok(Vec::new());
         }
         // First the log, then what trimming has moved out of it: nothing is missed, and what is
         // seen twice has one id.
         let mut newest = self.audit_of_the_log(query).await?;
-        let find = self
-            .tables
+        let find = tables
             .audit
             .find(audit_filter(query))
             .sort(doc! { "_id": -1 })
@@ -277,6 +281,7 @@ impl MongoStore {
         &self,
         query: &AuditQuery,
     ) -> Result<BTreeMap<String, AuditRow>, StoreError> {
+        let tables = self.tables();
         // Below the floor they were moved.
         let floor = signed(self.read_floor().await?);
         let (first, last) = ids_of(query);
@@ -289,7 +294,7 @@ impl MongoStore {
             matching.insert("audit", doc! { "$elemMatch": entry });
         }
         let oldest = now().as_millis() - AUDIT_KEPT_MS;
-        let find = self.tables.events.find(matching).sort(doc! { "audit_last": -1 });
+        let find = tables.events.find(matching).sort(doc! { "audit_last": -1 });
         let find = find.projection(doc! { "audit": 1, "audit_last": 1 });
         limited_steps(USUAL, async {
             let mut newest = BTreeMap::new();
@@ -331,13 +336,12 @@ impl MongoStore {
         &self,
         ids: &[&str],
     ) -> Result<Vec<IdempotencyRow>, StoreError> {
+        let tables = self.tables();
         // What is below the floor was moved; a record that is still there may be one that came too
         // late.
         let floor = signed(self.read_floor().await?);
-        let find = self
-            .tables
-            .events
-            .find(doc! { "answers._id": { "$in": ids }, "last": { "$gt": floor } });
+        let find =
+            tables.events.find(doc! { "answers._id": { "$in": ids }, "last": { "$gt": floor } });
         let asked = doc! { "$filter": { "input": "$answers", "as": "answer",
         "cond": { "$in": ["$$answer._id", ids] } } };
         let find = find.projection(doc! { "answers": asked });
@@ -348,7 +352,7 @@ impl MongoStore {
         });
         let mut answers: Vec<IdempotencyRow> = logged.await?.into_iter().flatten().collect();
         answers.retain(|row| ids.contains(&row.id.as_str()));
-        let find = self.tables.idempotency.find(doc! { "_id": { "$in": ids } });
+        let find = tables.idempotency.find(doc! { "_id": { "$in": ids } });
         answers.extend(collect(find, rows::read_idempotency).await?);
         Ok(answers)
     }
@@ -399,8 +403,9 @@ impl MongoStore {
     }
 
     pub(super) async fn read_tokens(&self, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {
+        let tables = self.tables();
         let filter = doc! { "expire_time": { "$gt": DateTime::from_millis(now.as_millis()) } };
-        let find = self.tables.tokens.find(filter).sort(doc! { "create_time": -1, "_id": -1 });
+        let find = tables.tokens.find(filter).sort(doc! { "create_time": -1, "_id": -1 });
         collect(find, |found| rows::read_token(found)?.decode()).await
     }
 }

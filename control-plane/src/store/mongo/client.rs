@@ -1,8 +1,13 @@
 //! The connection to the replica set.
 
 use std::future::IntoFuture;
+use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
+use arc_swap::ArcSwap;
+use blaze_domain::node_file::{MongoSection, SecretText};
+use blaze_runtime::read_password;
 use mongodb::bson::{Document, doc};
 use mongodb::options::{
     ClientOptions, DatabaseOptions, ReadConcern, ReadPreference, SelectionCriteria, WriteConcern,
@@ -31,11 +36,62 @@ pub(super) const USUAL: Duration = Duration::from_secs(10);
 /// Reading everything.
 pub(super) const LONG: Duration = Duration::from_secs(120);
 
+/// Where the store is, and its collections as they are reached now.
+pub(super) struct Connection {
+    section: MongoSection,
+    tables: ArcSwap<Tables>,
+}
+
+impl Connection {
+    /// # Errors
+    /// As [`Tables::connect`]; a password file that cannot be read is [`StoreError::Refused`].
+    pub(super) async fn open(section: &MongoSection) -> Result<Self, StoreError> {
+        let password = read(section.password_file.as_deref()).await?;
+        let tables = Tables::connect(section, password).await?;
+        Ok(Self { section: section.clone(), tables: ArcSwap::from_pointee(tables) })
+    }
+
+    pub(super) fn tables(&self) -> Arc<Tables> {
+        self.tables.load_full()
+    }
+
+    /// The collections as they are reached with the password that the file holds now, if that is
+    /// another one.
+    ///
+    /// # Errors
+    /// As [`Connection::open`].
+    pub(super) async fn connect_anew(&self) -> Result<Option<Tables>, StoreError> {
+        let password = read(self.section.password_file.as_deref()).await?;
+        if password == self.tables.load().password {
+            return Ok(None);
+        }
+        Tables::connect(&self.section, password).await.map(Some)
+    }
+
+    pub(super) fn replace(&self, tables: Tables) {
+        self.tables.store(Arc::new(tables));
+    }
+}
+
+async fn read(file: Option<&Path>) -> Result<Option<SecretText>, StoreError> {
+    let Some(file) = file.map(Path::to_owned) else {
+        return Ok(None);
+    };
+    match tokio::task::spawn_blocking(move || read_password(&file)).await {
+        Ok(Ok(password)) => Ok(Some(password.into())),
+        Ok(Err(error)) => Err(StoreError::Refused(error)),
+        // The runtime goes away.
+        Err(error) => Err(StoreError::Unavailable(error.to_string())),
+    }
+}
+
 /// The collections of a store. All of them read what no crash can take back, and write so that no
 /// crash can.
 #[derive(Clone)]
 pub(super) struct Tables {
     pub(super) client: Client,
+    /// What it logs in with, if that is not in the URI.
+    password: Option<SecretText>,
     pub(super) database: Database,
     /// Store identity, lease, notes.
     pub(super) meta: Collection<Document>,
@@ -63,10 +119,15 @@ impl Tables {
     /// # Errors
     /// [`StoreError::Refused`] for a wrong URI, name or password, and a server that is alone;
     /// [`StoreError::Unavailable`] if none answers.
-    pub(super) async fn connect(uri: &str, name: &str) -> Result<Self, StoreError> {
+    async fn connect(
+        section: &MongoSection,
+        password: Option<SecretText>,
+    ) -> Result<Self, StoreError> {
+        let name = &section.database;
         check_name(name)?;
         let app_name = format!("blaze-config/{name}");
-        let mut options = ClientOptions::parse(uri).await.map_err(store_error)?;
+        let uri = section.uri_with(password.as_ref());
+        let mut options = ClientOptions::parse(uri.reveal()).await.map_err(store_error)?;
         options.app_name = Some(app_name.clone());
         options.server_selection_timeout.get_or_insert(SELECTION);
         options.connect_timeout.get_or_insert(CONNECT);
@@ -88,6 +149,7 @@ impl Tables {
             idempotency: database.collection("idempotency"),
             tokens: database.collection("tokens"),
             client,
+            password,
             database,
             app_name,
             is_single: false,
@@ -187,7 +249,8 @@ mod tests {
     #[tokio::test]
     async fn a_uri_that_is_none_is_refused() {
         for uri in ["mongodb://", "http://127.0.0.1", "mongodb://h/?w=x&nonsense"] {
-            let found = Tables::connect(uri, "x").await.err();
+            let section = MongoSection::of(uri, "x");
+            let found = Tables::connect(&section, None).await.err();
             assert!(found.is_some(), "{uri}");
         }
     }

@@ -118,8 +118,9 @@ impl MongoStore {
     /// Removes what was written too late. If that fails, readers leave it out, and trimming removes
     /// it.
     async fn remove_late(&self, first: &EventRow) {
+        let tables = self.tables();
         let ours = doc! { "_id": { "$gte": first.revision }, "batch": &first.batch };
-        if let Err(error) = limited(QUICK, self.tables.events.delete_many(ours)).await {
+        if let Err(error) = limited(QUICK, tables.events.delete_many(ours)).await {
             tracing::warn!(
                 %error,
                 revision = first.revision,
@@ -168,6 +169,7 @@ impl MongoStore {
         first: &EventRow,
         proof: Proof,
     ) -> Result<(), CommitError> {
+        let tables = self.tables();
         let until = Instant::now() + LIMIT;
         let command = doc! {
             "insert": "events", "documents": [record],
@@ -186,7 +188,7 @@ impl MongoStore {
             Tried::Written => return Ok(()),
             Tried::Taken => return Err(CommitError::Conflict),
             Tried::Held => {
-                stale::end_idle_transactions(&self.tables).await;
+                stale::end_idle_transactions(&tables).await;
                 return Err(CommitError::Conflict);
             }
             Tried::Failed(error) => return Err(CommitError::NotWritten(error)),
@@ -212,7 +214,8 @@ impl MongoStore {
     }
 
     async fn try_insert(&self, command: &RawDocumentBuf) -> Tried {
-        let run = self.tables.database.run_raw_command(command.clone());
+        let tables = self.tables();
+        let run = tables.database.run_raw_command(command.clone());
         match timeout(TRY, run).await {
             Ok(Ok(answer)) => match write_code(&answer) {
                 Some(Wrong::Document(code, _)) if code == DUPLICATE_KEY => Tried::Taken,
@@ -241,11 +244,12 @@ impl MongoStore {
 
     /// Which batch has a revision, as no crash can change it any more.
     pub(super) async fn batch_at(&self, revision: i64) -> Result<Option<String>, StoreError> {
+        let tables = self.tables();
         // Once a majority has a later write, it has whatever was in the way of the insertion.
         let count = doc! { "$inc": { "count": 1_i64 } };
-        let later = self.tables.meta.update_one(doc! { "_id": "settled" }, count).upsert(true);
+        let later = tables.meta.update_one(doc! { "_id": "settled" }, count).upsert(true);
         limited(QUICK, later).await?;
-        let found = self.tables.events.find_one(doc! { "_id": revision });
+        let found = tables.events.find_one(doc! { "_id": revision });
         let found = limited(QUICK, found.projection(doc! { "batch": 1 })).await?;
         found.map(|found| rows::text(&found, "batch")).transpose()
     }
@@ -257,6 +261,7 @@ impl MongoStore {
         first: &EventRow,
         proof: Proof,
     ) -> Result<(), CommitError> {
+        let tables = self.tables();
         // Always the same session: a transaction on it ends what an earlier one may have left open
         // on the server.
         let mut place = self.session.lock().await;
@@ -276,13 +281,14 @@ impl MongoStore {
         *place = Some(session);
         drop(place);
         if self.is_held_for_long(first.revision, held) {
-            stale::end_idle_transactions(&self.tables).await;
+            stale::end_idle_transactions(&tables).await;
         }
         done
     }
 
     async fn start_session(&self) -> Result<ClientSession, StoreError> {
-        let start = self.tables.client.start_session().causal_consistency(false);
+        let tables = self.tables();
+        let start = tables.client.start_session().causal_consistency(false);
         super::client::limited(QUICK, start).await
     }
 
@@ -316,7 +322,7 @@ impl MongoStore {
         session: &mut ClientSession,
         group: Statements,
     ) -> Result<(), Fault> {
-        let tables = &self.tables;
+        let tables = self.tables();
         tables.events.insert_many(group.records).session(&mut *session).await?;
         if !group.versions.is_empty() {
             tables.versions.insert_many(group.versions).session(&mut *session).await?;
@@ -379,7 +385,7 @@ impl MongoStore {
         session: &mut ClientSession,
         revision: i64,
     ) -> mongodb::error::Result<Seen> {
-        let tables = &self.tables;
+        let tables = self.tables();
         begin(session).await?;
         let event = tables.events.find_one(doc! { "_id": revision }).session(&mut *session).await?;
         let floor = tables.documents.find_one(doc! { "_id": FLOOR }).session(&mut *session).await?;

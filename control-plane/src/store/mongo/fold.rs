@@ -319,11 +319,12 @@ impl MongoStore {
     /// Removes records across a revision under which others lie: they came too late, see
     /// [`super::fence`].
     async fn remove_late_below(&self, revision: i64) -> Result<(), StoreError> {
+        let tables = self.tables();
         let across = doc! {
             "_id": { "$lte": revision, "$gt": revision - RECORD_COMMITS },
             "last": { "$gt": revision },
         };
-        let events = &self.tables.events;
+        let events = &tables.events;
         let found = events.find(across).projection(doc! { "last": 1, "batch": 1 });
         let across = collect(found, |found| {
             Ok((
@@ -349,9 +350,10 @@ impl MongoStore {
             return Ok(());
         }
         let newest = signed(self.read_head().await?);
-        let events = &self.tables.events;
         let mut place = 0;
         loop {
+            let tables = self.tables();
+            let events = &tables.events;
             let oldest = events.find_one(doc! { "_id": { "$gt": place } }).sort(doc! { "_id": 1 });
             let oldest = limited(USUAL, oldest.projection(doc! { "_id": 1 })).await?;
             let oldest = oldest.map(|found| rows::integer(&found, "_id")).transpose()?;

@@ -74,12 +74,13 @@ impl MongoStore {
     /// costs least: a stream of the commits would cost the database as much as they do, all of
     /// which are our own.
     async fn open_idle(&self, place: &mut Option<Stream>) {
+        let tables = self.tables();
         if matches!(place, Some(Stream::Idle(_))) {
             return;
         }
         *place = None;
-        if self.tables.is_single {
-            match limited(QUICK, self.tables.migrations.watch()).await {
+        if tables.is_single {
+            match limited(QUICK, tables.migrations.watch()).await {
                 Ok(stream) => *place = Some(Stream::Idle(stream)),
                 Err(error) => {
                     tracing::debug!(
@@ -92,12 +93,13 @@ impl MongoStore {
     }
 
     async fn open_stream(&self) -> Result<Changes, crate::store::StoreError> {
+        let tables = self.tables();
         let pipeline = [
             doc! { "$match": { "operationType": "insert",
             "fullDocument.writer": { "$ne": &self.writer } } },
             doc! { "$project": { "fullDocument": 0 } },
         ];
-        limited(QUICK, self.tables.events.watch().pipeline(pipeline)).await
+        limited(QUICK, tables.events.watch().pipeline(pipeline)).await
     }
 }
 

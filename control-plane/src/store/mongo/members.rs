@@ -30,7 +30,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::client::{QUICK, Tables, limited};
+use super::client::{Connection, QUICK, limited};
 use super::errors::{is_duplicate, store_error};
 use super::fence::since_boot;
 use super::{read, rows};
@@ -213,12 +213,12 @@ impl Members {
     ///
     /// # Errors
     /// [`StoreError`].
-    pub(super) async fn join(tables: &Tables, id: &str) -> Result<Self, StoreError> {
+    pub(super) async fn join(connection: &Arc<Connection>, id: &str) -> Result<Self, StoreError> {
         let (sender, standing) = watch::channel(Standing::default());
         let reads = Arc::new(Reads::default());
         let mut beating = Beating {
             reads: Arc::clone(&reads),
-            tables: tables.clone(),
+            connection: Arc::clone(connection),
             me: id.to_owned(),
             heard: Heard::default(),
             last: None,
@@ -293,7 +293,7 @@ fn left_out() -> StoreError {
 /// The task that exchanges.
 struct Beating {
     reads: Arc<Reads>,
-    tables: Tables,
+    connection: Arc<Connection>,
     me: String,
     heard: Heard,
     /// What was written last, as long as nobody else is known to have written.
@@ -365,7 +365,7 @@ impl Beating {
                 _ if has_others => None,
                 Some(above) if is_mine && stayed => Some(above),
                 // Nobody else can write from now on, so this is all.
-                _ => Some(read::newest(&self.tables).await?),
+                _ => Some(read::newest(&self.connection.tables()).await?),
             };
             self.last = Some(next);
             self.standing.send_replace(standing);
@@ -377,7 +377,8 @@ impl Beating {
     }
 
     async fn read(&self) -> Result<Table, StoreError> {
-        let found = limited(QUICK, self.tables.meta.find_one(doc! { "_id": TABLE })).await?;
+        let found =
+            limited(QUICK, self.connection.tables().meta.find_one(doc! { "_id": TABLE })).await?;
         found.as_ref().map_or_else(|| Ok(Table::default()), Table::read)
     }
 
@@ -385,7 +386,8 @@ impl Beating {
     async fn write(&self, old: &Table, new: &Table) -> Result<bool, StoreError> {
         if old.turn == 0 {
             let insert =
-                timeout(QUICK, self.tables.meta.insert_one(new.write()).into_future()).await;
+                timeout(QUICK, self.connection.tables().meta.insert_one(new.write()).into_future())
+                    .await;
             return match insert {
                 Ok(Ok(_)) => Ok(true),
                 Ok(Err(error)) if is_duplicate(&error) => Ok(false),
@@ -394,7 +396,8 @@ impl Beating {
             };
         }
         let which = doc! { "_id": TABLE, "turn": old.turn };
-        let done = limited(QUICK, self.tables.meta.replace_one(which, new.write())).await?;
+        let done =
+            limited(QUICK, self.connection.tables().meta.replace_one(which, new.write())).await?;
         match done.matched_count {
             0 => Ok(false),
             1 => Ok(true),

@@ -72,19 +72,18 @@ impl MongoStore {
     }
 
     async fn insert_floor(&self) -> Result<(), StoreError> {
+        let tables = self.tables();
         let floor = doc! { "$setOnInsert": { FLOOR: 0_i64, "folded": 0_i64, "turn": 0_i64,
         "rewrites": 0_i64 } };
-        let insert = self.tables.documents.update_one(doc! { "_id": FLOOR }, floor).upsert(true);
+        let insert = tables.documents.update_one(doc! { "_id": FLOOR }, floor).upsert(true);
         limited(USUAL, insert).await?;
         Ok(())
     }
 
     async fn insert_if_absent(&self, id: &str, value: Document) -> Result<(), StoreError> {
-        let insert = self
-            .tables
-            .meta
-            .update_one(doc! { "_id": id }, doc! { "$setOnInsert": value })
-            .upsert(true);
+        let tables = self.tables();
+        let insert =
+            tables.meta.update_one(doc! { "_id": id }, doc! { "$setOnInsert": value }).upsert(true);
         let insert = async {
             match insert.await {
                 Err(error) if !is_duplicate(&error) => Err(error),
@@ -100,9 +99,10 @@ impl MongoStore {
 
     /// A command that does nothing when it is done again.
     async fn command(&self, mut command: Document) -> Result<(), StoreError> {
+        let tables = self.tables();
         command.insert("writeConcern", doc! { "w": "majority", "j": true });
         let run = async {
-            match self.tables.database.run_command(command).await {
+            match tables.database.run_command(command).await {
                 Err(error) if command_code(&error) != Some(NAMESPACE_EXISTS) => Err(error),
                 Ok(_) | Err(_) => Ok(()),
             }
@@ -111,12 +111,13 @@ impl MongoStore {
     }
 
     async fn take_lease(&self) -> Result<Option<i64>, StoreError> {
+        let tables = self.tables();
         let run_out = doc! { "_id": "lease", "$expr": { "$lt": ["$until", "$$NOW"] } };
         let take = doc! { "$set": {
             "holder": &self.writer, "until": { "$add": ["$$NOW", LEASE_MS] },
             "fence": { "$add": ["$fence", 1_i64] },
         } };
-        let take = self.tables.meta.find_one_and_update(run_out, vec![take]);
+        let take = tables.meta.find_one_and_update(run_out, vec![take]);
         let taken =
             limited(USUAL, take.return_document(mongodb::options::ReturnDocument::After)).await?;
         taken.map(|lease| rows::integer(&lease, "fence")).transpose()
@@ -124,14 +125,15 @@ impl MongoStore {
 
     /// A restore that was cut off has left a part of the documents.
     async fn refuse_half_restored(&self) -> Result<(), StoreError> {
-        let found = limited(USUAL, self.tables.meta.find_one(doc! { "_id": "store" })).await?;
+        let tables = self.tables();
+        let found = limited(USUAL, tables.meta.find_one(doc! { "_id": "store" })).await?;
         let half = found.is_some_and(|store| store.get_bool("restoring").unwrap_or(false));
         match half {
             false => Ok(()),
             true => Err(StoreError::Refused(format!(
                 "a restore into the database {} was not finished: drop the database, and restore \
                  again",
-                self.tables.database.name()
+                tables.database.name()
             ))),
         }
     }
@@ -147,8 +149,8 @@ impl Lease<'_> {
     }
 
     async fn renew(&self) -> Result<(), StoreError> {
-        let renewed =
-            limited(USUAL, self.store.tables.meta.update_one(self.mine(), Self::renewal())).await?;
+        let tables = self.store.tables();
+        let renewed = limited(USUAL, tables.meta.update_one(self.mine(), Self::renewal())).await?;
         match renewed.matched_count {
             0 => Err(lost()),
             _ => Ok(()),
@@ -156,10 +158,9 @@ impl Lease<'_> {
     }
 
     async fn give_back(&self) {
+        let tables = self.store.tables();
         let free = doc! { "$set": { "until": mongodb::bson::DateTime::MIN } };
-        if let Err(error) =
-            limited(USUAL, self.store.tables.meta.update_one(self.mine(), free)).await
-        {
+        if let Err(error) = limited(USUAL, tables.meta.update_one(self.mine(), free)).await {
             tracing::debug!(%error, "the lease for migrations runs out by itself");
         }
     }
@@ -202,7 +203,7 @@ impl Target for Lease<'_> {
     }
 
     async fn state(&self) -> Result<(Vec<Done>, u32), StoreError> {
-        let tables = &self.store.tables;
+        let tables = self.store.tables();
         let find = tables.migrations.find(doc! {}).sort(doc! { "_id": 1 });
         let done = collect(find, |found| {
             Ok(Done {
@@ -241,9 +242,10 @@ impl Target for Lease<'_> {
     }
 
     async fn raise_min_version(&self, version: u32) -> Result<(), StoreError> {
+        let tables = self.store.tables();
         self.renew().await?;
         let raise = doc! { "$max": { "min_version": i64::from(version) } };
-        limited(USUAL, self.store.tables.meta.update_one(doc! { "_id": "store" }, raise)).await?;
+        limited(USUAL, tables.meta.update_one(doc! { "_id": "store" }, raise)).await?;
         Ok(())
     }
 }

@@ -36,18 +36,21 @@ mod trim;
 mod upkeep;
 
 use std::future::IntoFuture;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_domain::config::{Document as Config, Key, Timestamp};
+use blaze_domain::node_file::MongoSection;
+use blaze_runtime::pause;
 use futures::TryStreamExt as _;
 use mongodb::bson::Document;
 use mongodb::{ClientSession, Cursor};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use self::client::{Tables, USUAL, limited_steps};
+use self::client::{Connection, Tables, USUAL, limited_steps};
 use self::errors::store_error;
 use self::fence::Fence;
 use self::follow::Stream;
@@ -61,12 +64,14 @@ use super::{
     IdempotencyRecord, Snapshot, StoreError, TokenRecord, TokenStore, Version,
 };
 
+/// Between two looks at the file of the password.
+const PASSWORD_LOOK: Duration = Duration::from_secs(1);
 /// Of a record, before one was read.
 const USUAL_RECORD_BYTES: i64 = 16 * 1024;
 
 /// A store in a database of a replica set.
 pub struct MongoStore {
-    tables: Tables,
+    connection: Arc<Connection>,
     /// Which opening of the store this is; marks its commits, so that it need not be told of them.
     writer: String,
     /// Itself and others; none before it is open.
@@ -102,8 +107,8 @@ impl MongoStore {
     /// # Errors
     /// [`StoreError::Refused`] for a server without transactions, a wrong password, a database of a
     /// newer program; [`StoreError::Unavailable`] if no primary answers.
-    pub async fn open(uri: &str, database: &str) -> Result<Self, StoreError> {
-        Self::open_with(uri, database, &Migrations::default()).await
+    pub async fn open(section: &MongoSection) -> Result<Self, StoreError> {
+        Self::open_with(section, &Migrations::default()).await
     }
 
     /// As [`MongoStore::open`], with migrations of one's own.
@@ -111,13 +116,12 @@ impl MongoStore {
     /// # Errors
     /// As [`MongoStore::open`].
     pub async fn open_with(
-        uri: &str,
-        database: &str,
+        section: &MongoSection,
         migrations: &Migrations,
     ) -> Result<Self, StoreError> {
-        let mut store = Self::connect(uri, database).await?;
+        let mut store = Self::connect(section).await?;
         store.migrate(migrations).await?;
-        store.members = Some(Members::join(&store.tables, &store.writer).await?);
+        store.members = Some(Members::join(&store.connection, &store.writer).await?);
         Ok(store)
     }
 
@@ -136,19 +140,15 @@ impl MongoStore {
     /// [`StoreError`].
     #[doc(hidden)]
     pub async fn records(&self) -> Result<u64, StoreError> {
-        client::limited(USUAL, self.tables.events.count_documents(mongodb::bson::doc! {})).await
+        client::limited(USUAL, self.tables().events.count_documents(mongodb::bson::doc! {})).await
     }
 
     /// What opening the database would migrate. Nothing is changed.
     ///
     /// # Errors
     /// As [`MongoStore::open`].
-    pub async fn plan(
-        uri: &str,
-        database: &str,
-        migrations: &Migrations,
-    ) -> Result<Plan, StoreError> {
-        let store = Self::connect(uri, database).await?;
+    pub async fn plan(section: &MongoSection, migrations: &Migrations) -> Result<Plan, StoreError> {
+        let store = Self::connect(section).await?;
         let plan = store.plan_of(migrations).await;
         store.close().await;
         plan
@@ -159,17 +159,16 @@ impl MongoStore {
     /// # Errors
     /// [`StoreError::Refused`] if it is of another schema than this program's; [`StoreError`].
     pub async fn export_beside(
-        uri: &str,
-        database: &str,
+        section: &MongoSection,
         pieces: mpsc::Sender<Piece>,
     ) -> Result<(), StoreError> {
-        let store = Self::connect(uri, database).await?;
+        let store = Self::connect(section).await?;
         let plan = store.plan_of(&Migrations::default()).await?;
         let done = match plan.pending.is_empty() {
             true => store.send_all(&pieces).await,
             false => Err(StoreError::Refused(format!(
-                "{database} is no store of schema {}: run `blaze-config migrate` first",
-                plan.target
+                "{} is no store of schema {}: run `blaze-config migrate` first",
+                section.database, plan.target
             ))),
         };
         store.close().await;
@@ -201,9 +200,45 @@ impl MongoStore {
         self.members.as_ref().is_none_or(|members| members.is_still(joined))
     }
 
-    async fn connect(uri: &str, database: &str) -> Result<Self, StoreError> {
+    /// The collections, as they are reached now. Whoever works with a session takes them once.
+    fn tables(&self) -> Arc<Tables> {
+        self.connection.tables()
+    }
+
+    /// Connects anew whenever the file of the password holds another one, for ever. Until the
+    /// server takes that, the connections of before serve.
+    pub async fn follow_password(&self) {
+        let mut is_told = false;
+        loop {
+            pause(PASSWORD_LOOK).await;
+            match self.connection.connect_anew().await {
+                Ok(None) => is_told = false,
+                Ok(Some(tables)) => {
+                    {
+                        // A session is of the client that made it.
+                        let mut session = self.session.lock().await;
+                        self.connection.replace(tables);
+                        *session = None;
+                    }
+                    // It would keep the client of before.
+                    self.stream.lock().await.take();
+                    tracing::info!("connected to MongoDB with another password");
+                }
+                Err(error) if !is_told => {
+                    is_told = true;
+                    tracing::warn!(
+                        %error,
+                        "the password of MongoDB that the file holds is not used",
+                    );
+                }
+                Err(_) => {}
+            }
+        }
+    }
+
+    async fn connect(section: &MongoSection) -> Result<Self, StoreError> {
         Ok(Self {
-            tables: Tables::connect(uri, database).await?,
+            connection: Arc::new(Connection::open(section).await?),
             writer: uuid::Uuid::now_v7().to_string(),
             members: None,
             doubt: AtomicU64::new(0),
@@ -389,6 +424,6 @@ impl Upkeep for MongoStore {
         // Both hold on to the connection.
         self.stream.lock().await.take();
         self.session.lock().await.take();
-        self.tables.client.clone().shutdown().immediate(true).await;
+        self.tables().client.clone().shutdown().immediate(true).await;
     }
 }

@@ -42,8 +42,9 @@ pub(super) struct Part {
 impl MongoStore {
     /// The newest revision that a majority has.
     pub(super) async fn read_head(&self) -> Result<u64, StoreError> {
+        let tables = self.tables();
         let asked = since_boot();
-        let head = newest(&self.tables).await?;
+        let head = newest(&tables).await?;
         self.fence.lock().newest_was(signed(head), asked, since_boot());
         Ok(head)
     }
@@ -53,12 +54,14 @@ impl MongoStore {
     }
 
     pub(super) async fn has_guard(&self) -> Result<bool, StoreError> {
-        let found = limited(QUICK, self.tables.documents.find_one(doc! { "_id": FLOOR })).await?;
+        let tables = self.tables();
+        let found = limited(QUICK, tables.documents.find_one(doc! { "_id": FLOOR })).await?;
         Ok(found.is_some())
     }
 
     pub(super) async fn read_guard(&self) -> Result<Guard, StoreError> {
-        guard(&self.tables).await
+        let tables = self.tables();
+        guard(&tables).await
     }
 
     /// Everything in one snapshot.
@@ -76,9 +79,10 @@ impl MongoStore {
     }
 
     async fn read_snapshot(&self) -> Result<Result<Snapshot, StoreError>, Error> {
+        let tables = self.tables();
         // A snapshot session brings its read concern; one of the collection would stand in its way.
-        let plain = self.tables.client.database(self.tables.database.name());
-        let mut session = self.tables.client.start_session().snapshot(true).await?;
+        let plain = tables.client.database(tables.database.name());
+        let mut session = tables.client.start_session().snapshot(true).await?;
         let meta = plain.collection::<Document>("meta");
         let meta = meta.find_one(doc! { "_id": "store" }).session(&mut session).await?;
         let documents = plain.collection::<Document>("documents");
@@ -143,13 +147,14 @@ impl MongoStore {
 
     /// The record that has both a revision and the next one.
     async fn find_around(&self, revision: i64) -> Result<Vec<Record>, StoreError> {
+        let tables = self.tables();
         let pipeline = [
             doc! { "$match": { "_id": { "$lte": revision } } },
             doc! { "$sort": { "_id": -1 } },
             doc! { "$limit": 1 },
             doc! { "$match": { "last": { "$gt": revision } } },
         ];
-        super::collect(self.tables.events.aggregate(pipeline), rows::read_record).await
+        super::collect(tables.events.aggregate(pipeline), rows::read_record).await
     }
 
     async fn find_records(
@@ -157,7 +162,8 @@ impl MongoStore {
         filter: Document,
         part: Part,
     ) -> Result<(Vec<Record>, bool), StoreError> {
-        let mut find = self.tables.events.find(filter).sort(doc! { "_id": 1 });
+        let tables = self.tables();
+        let mut find = tables.events.find(filter).sort(doc! { "_id": 1 });
         find = find.batch_size(batch(part, self.record_bytes.load(Ordering::Relaxed)));
         if !part.whole {
             find = find.projection(doc! { "audit": 0, "answers": 0 });
@@ -190,11 +196,12 @@ impl MongoStore {
 
     /// Adds the changes that records had no room for.
     async fn complete(&self, records: &mut [Record]) -> Result<(), StoreError> {
+        let tables = self.tables();
         let lacking: Vec<i64> = records.iter().flat_map(Record::incomplete).collect();
         if lacking.is_empty() {
             return Ok(());
         }
-        let find = self.tables.versions.find(doc! { "revision": { "$in": lacking } });
+        let find = tables.versions.find(doc! { "revision": { "$in": lacking } });
         fill(records, super::collect(find, rows::read_version).await?);
         Ok(())
     }

@@ -31,12 +31,12 @@ impl MongoStore {
             + Send
             + Sync,
     {
+        let tables = self.tables();
         let until = Instant::now() + USUAL;
-        let mut session = limited(USUAL, self.tables.client.start_session()).await?;
+        let mut session = limited(USUAL, tables.client.start_session()).await?;
         loop {
             let tried =
-                limited_steps(USUAL, async { Ok(once(&self.tables, &mut session, &work).await) })
-                    .await;
+                limited_steps(USUAL, async { Ok(once(&tables, &mut session, &work).await) }).await;
             match tried {
                 Ok(Ok(done)) => return Ok(done),
                 Ok(Err(error))

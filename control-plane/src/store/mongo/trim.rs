@@ -121,7 +121,8 @@ impl MongoStore {
 
     /// The next revision that has versions, or a record in the log that reaches it.
     async fn next_change(&self, above: i64) -> Result<Option<i64>, StoreError> {
-        let kept = self.tables.versions.find_one(doc! { "revision": { "$gt": above } });
+        let tables = self.tables();
+        let kept = tables.versions.find_one(doc! { "revision": { "$gt": above } });
         let kept = kept.sort(doc! { "revision": 1 }).projection(doc! { "revision": 1 });
         let kept = limited(USUAL, kept).await?;
         let kept = kept.map(|found| rows::integer(&found, "revision")).transpose()?;
@@ -129,7 +130,7 @@ impl MongoStore {
             "_id": { "$gt": above.saturating_sub(RECORD_COMMITS) },
             "last": { "$gt": above },
         };
-        let logged = self.tables.events.find_one(near).sort(doc! { "_id": 1 });
+        let logged = tables.events.find_one(near).sort(doc! { "_id": 1 });
         let logged = limited(USUAL, logged.projection(doc! { "_id": 1 })).await?;
         let logged = logged.map(|found| rows::integer(&found, "_id")).transpose()?;
         let logged = logged.map(|first| first.max(above + 1));
@@ -161,9 +162,10 @@ impl MongoStore {
     }
 
     async fn kept_revisions(&self, keys: &[String]) -> Result<Revisions, StoreError> {
+        let tables = self.tables();
         let each: Vec<Document> =
             keys.iter().map(|key| rows::versions_below(key, i64::MAX)).collect();
-        let find = self.tables.versions.find(doc! { "$or": each }).projection(doc! { "_id": 1 });
+        let find = tables.versions.find(doc! { "$or": each }).projection(doc! { "_id": 1 });
         let mut kept = Revisions::new();
         collect_within(LONG, find, |found| {
             let id = rows::text(found, "_id")?;
@@ -183,12 +185,12 @@ impl MongoStore {
         now: Trimmed,
         most: usize,
     ) -> Result<(Revisions, usize), StoreError> {
+        let tables = self.tables();
         let mut logged = Revisions::new();
         if keys.is_empty() {
             return Ok((logged, 0));
         }
-        let find = self
-            .tables
+        let find = tables
             .events
             .find(doc! {
                 "docs.key": { "$in": keys },
@@ -214,23 +216,24 @@ impl MongoStore {
     }
 
     async fn remove_named(&self, ids: Vec<String>) -> Result<(), StoreError> {
+        let tables = self.tables();
         if !ids.is_empty() {
-            limited(USUAL, self.tables.versions.delete_many(doc! { "_id": { "$in": ids } }))
-                .await?;
+            limited(USUAL, tables.versions.delete_many(doc! { "_id": { "$in": ids } })).await?;
         }
         Ok(())
     }
 
     /// Documents that changed above one revision and up to another.
     async fn changed_keys(&self, above: i64, until: i64) -> Result<BTreeSet<String>, StoreError> {
+        let tables = self.tables();
         let range = doc! { "revision": { "$gt": above, "$lte": until } };
-        let find = self.tables.versions.find(range).projection(doc! { "_id": 1 });
+        let find = tables.versions.find(range).projection(doc! { "_id": 1 });
         let kept = collect_within(LONG, find, |found| {
             Ok(rows::split_version_id(&rows::text(found, "_id")?)?.0.to_owned())
         });
         let mut keys: BTreeSet<String> = kept.await?.into_iter().collect();
         let range = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS), "$lte": until } };
-        let find = self.tables.events.find(range).projection(doc! { "docs.key": 1 });
+        let find = tables.events.find(range).projection(doc! { "docs.key": 1 });
         let logged = collect_within(LONG, find, |found| {
             let docs = rows::members(found, "docs");
             docs.map(|change| rows::text(change?, "key")).collect::<Result<Vec<_>, _>>()
@@ -241,25 +244,28 @@ impl MongoStore {
 
     /// Moves on the time by which records expire.
     pub(super) async fn move_expiry(&self, clock: i64, most: Duration) -> Result<i64, StoreError> {
+        let tables = self.tables();
         let before = match self.expiry().await? {
             None => self.newest_time().await?,
             before => before,
         };
         let time = retain::expiry_time(clock, before, most);
         let set = doc! { "$set": { "time": time } };
-        let set = self.tables.meta.update_one(doc! { "_id": EXPIRY }, set).upsert(true);
+        let set = tables.meta.update_one(doc! { "_id": EXPIRY }, set).upsert(true);
         limited(USUAL, set).await?;
         Ok(time)
     }
 
     async fn expiry(&self) -> Result<Option<i64>, StoreError> {
-        let found = limited(USUAL, self.tables.meta.find_one(doc! { "_id": EXPIRY })).await?;
+        let tables = self.tables();
+        let found = limited(USUAL, tables.meta.find_one(doc! { "_id": EXPIRY })).await?;
         found.map(|found| rows::integer(&found, "time")).transpose()
     }
 
     /// Time of the newest commit.
     async fn newest_time(&self) -> Result<Option<i64>, StoreError> {
-        let find = self.tables.events.find_one(doc! {}).sort(doc! { "_id": -1 });
+        let tables = self.tables();
+        let find = tables.events.find_one(doc! {}).sort(doc! { "_id": -1 });
         let find = find.projection(doc! { "commits.time": 1, "last": 1 });
         let Some(record) = limited(USUAL, find).await? else { return Ok(None) };
         let last = rows::integer(&record, "last")?;
@@ -267,16 +273,18 @@ impl MongoStore {
     }
 
     async fn write_note(&self, done: Trimmed) -> Result<(), StoreError> {
+        let tables = self.tables();
         let note = doc! { "$set": { "floor": done.floor, "head": done.head,
         "keep": i64::from(done.keep) } };
-        let note = self.tables.meta.update_one(doc! { "_id": "trimmed" }, note).upsert(true);
+        let note = tables.meta.update_one(doc! { "_id": "trimmed" }, note).upsert(true);
         limited(USUAL, note).await?;
         Ok(())
     }
 
     /// How far the last trimming came; what is not there means that everything is looked at.
     async fn read_note(&self) -> Result<Trimmed, StoreError> {
-        let found = limited(USUAL, self.tables.meta.find_one(doc! { "_id": "trimmed" })).await?;
+        let tables = self.tables();
+        let found = limited(USUAL, tables.meta.find_one(doc! { "_id": "trimmed" })).await?;
         Ok(found.as_ref().and_then(note).unwrap_or_default())
     }
 }

@@ -7,7 +7,7 @@ use mongodb::bson::{Document, doc};
 use mongodb::{ClientSession, Collection, Database};
 use tokio::sync::mpsc;
 
-use super::client::{LONG, USUAL, limited};
+use super::client::{LONG, Tables, USUAL, limited};
 use super::errors::write_error;
 use super::rows::{self, FLOOR, Guard, Record};
 use super::statements::RECORD_COMMITS;
@@ -37,7 +37,8 @@ impl MongoStore {
     /// Sends everything, read in one snapshot. A server keeps a snapshot for five minutes
     /// (`minSnapshotHistoryWindowInSeconds`).
     pub(super) async fn send_all(&self, pieces: &mpsc::Sender<Piece>) -> Result<(), StoreError> {
-        let tables: [(&str, ReadRow); 4] = [
+        let tables = self.tables();
+        let kinds: [(&str, ReadRow); 4] = [
             ("versions", |found| rows::read_version(found).map(Row::Version)),
             ("audit", |found| rows::read_audit(found).map(Box::new).map(Row::Audit)),
             ("tokens", |found| rows::read_token(found).map(Row::Token)),
@@ -45,8 +46,8 @@ impl MongoStore {
         ];
         // A snapshot session brings its read concern; one of the collections would stand in its
         // way.
-        let plain = self.tables.client.database(self.tables.database.name());
-        let mut session = limited(USUAL, self.tables.client.start_session().snapshot(true)).await?;
+        let plain = tables.client.database(tables.database.name());
+        let mut session = limited(USUAL, tables.client.start_session().snapshot(true)).await?;
         let (head, guard) = read_head(&plain, &mut session).await?;
         send(pieces, Piece::Head(head)).await?;
         let row = |row| send(pieces, Piece::Row(BackupRow(row)));
@@ -64,7 +65,7 @@ impl MongoStore {
         for new in changed.into_values().flatten() {
             row(Row::Document(new)).await?;
         }
-        for (table, read) in tables {
+        for (table, read) in kinds {
             let table = plain.collection::<Document>(table);
             let find = table.find(doc! {}).sort(doc! { "_id": 1 });
             let mut cursor = limited(USUAL, async { find.session(&mut session).await }).await?;
@@ -179,21 +180,23 @@ impl MongoStore {
 
     /// The log goes on above a revision, and the documents are those of it.
     async fn start_at(&self, revision: i64) -> Result<(), StoreError> {
+        let tables = self.tables();
         let guard = doc! { "$max": { FLOOR: revision, "folded": revision } };
-        limited(USUAL, self.tables.documents.update_one(doc! { "_id": FLOOR }, guard)).await?;
+        limited(USUAL, tables.documents.update_one(doc! { "_id": FLOOR }, guard)).await?;
         Ok(())
     }
 
     async fn mark(&self, change: Document) -> Result<(), StoreError> {
-        limited(USUAL, self.tables.meta.update_one(doc! { "_id": "store" }, change)).await?;
+        let tables = self.tables();
+        limited(USUAL, tables.meta.update_one(doc! { "_id": "store" }, change)).await?;
         Ok(())
     }
 
     async fn is_empty(&self) -> Result<bool, StoreError> {
+        let tables = self.tables();
         if self.read_head().await? != 0 {
             return Ok(false);
         }
-        let tables = &self.tables;
         for table in [&tables.documents, &tables.versions, &tables.tokens] {
             let any =
                 table.find_one(doc! { "_id": { "$ne": FLOOR } }).projection(doc! { "_id": 1 });
@@ -212,6 +215,7 @@ impl MongoStore {
         make: Rewriter<'_>,
         before: BeforeStep<'_>,
     ) -> Result<u64, StoreError> {
+        let tables = self.tables();
         if !self.has_guard().await? {
             // It was never opened, so it has no documents.
             return Ok(0);
@@ -220,9 +224,9 @@ impl MongoStore {
         self.fold_until(signed(head)).await?;
         let mut replaced = self.rewrite_log(make, before).await?;
         let count = doc! { "$inc": { "rewrites": 1_i64 } };
-        limited(USUAL, self.tables.documents.update_one(doc! { "_id": FLOOR }, count)).await?;
-        replaced += self.rewrite_table(&self.tables.documents, make, before).await?;
-        Ok(replaced + self.rewrite_table(&self.tables.versions, make, before).await?)
+        limited(USUAL, tables.documents.update_one(doc! { "_id": FLOOR }, count)).await?;
+        replaced += self.rewrite_table(|tables| &tables.documents, make, before).await?;
+        Ok(replaced + self.rewrite_table(|tables| &tables.versions, make, before).await?)
     }
 
     /// Below the floor, too, for as long as it is there.
@@ -234,8 +238,9 @@ impl MongoStore {
         let (mut place, mut replaced) = (i64::MIN, 0);
         loop {
             before().await?;
+            let tables = self.tables();
             let behind = doc! { "_id": { "$gt": place } };
-            let find = self.tables.events.find(behind).sort(doc! { "_id": 1 }).limit(STEP / 4);
+            let find = tables.events.find(behind).sort(doc! { "_id": 1 }).limit(STEP / 4);
             let find = find.projection(doc! { "docs.key": 1, "docs.document": 1 });
             let found = collect(find, |found| Ok(found.clone())).await?;
             let Some(last) = found.last() else {
@@ -253,6 +258,7 @@ impl MongoStore {
         record: &Document,
         make: Rewriter<'_>,
     ) -> Result<u64, StoreError> {
+        let tables = self.tables();
         let (mut old, mut new) = (doc! { "_id": rows::integer(record, "_id")? }, Document::new());
         for (place, change) in rows::members(record, "docs").enumerate() {
             let change = change?;
@@ -269,20 +275,22 @@ impl MongoStore {
             return Ok(0);
         }
         let count = u64::try_from(new.len()).map_err(corrupt)?;
-        let update = self.tables.events.update_one(old, doc! { "$set": new });
+        let update = tables.events.update_one(old, doc! { "$set": new });
         let done = limited(LONG, update).await?;
         Ok(count * done.modified_count)
     }
 
     async fn rewrite_table(
         &self,
-        table: &Collection<Document>,
+        table: fn(&Tables) -> &Collection<Document>,
         make: Rewriter<'_>,
         before: BeforeStep<'_>,
     ) -> Result<u64, StoreError> {
         let (mut place, mut replaced) = (String::new(), 0);
         loop {
             before().await?;
+            let tables = self.tables();
+            let table = table(&tables);
             let behind = doc! { "_id": { "$gt": &place, "$ne": FLOOR } };
             let find = table.find(behind).sort(doc! { "_id": 1 }).limit(STEP);
             let find = find.projection(doc! { "_id": 1, "document": 1 });
@@ -309,11 +317,12 @@ impl MongoStore {
     }
 
     async fn replace(&self, table: &str, updates: Vec<Document>) -> Result<u64, StoreError> {
+        let tables = self.tables();
         let command = doc! {
             "update": table, "updates": updates, "ordered": false,
             "writeConcern": { "w": "majority", "j": true },
         };
-        let answer = limited(LONG, self.tables.database.run_command(command)).await?;
+        let answer = limited(LONG, tables.database.run_command(command)).await?;
         match write_error(&answer) {
             Some(error) => Err(error),
             None => u64::try_from(rows::integer(&answer, "nModified")?).map_err(corrupt),
@@ -421,7 +430,7 @@ impl Filling {
     async fn flush_all(&mut self, store: &MongoStore) -> Result<(), StoreError> {
         self.bytes = 0;
         for (table, rows) in std::mem::take(&mut self.waiting) {
-            let table = store.tables.database.collection::<Document>(table);
+            let table = store.tables().database.collection::<Document>(table);
             // No retry by ourselves: a restore that fails is done again, into a new database.
             limited(LONG, async { table.insert_many(rows).await.map(|_| ()) }).await?;
         }

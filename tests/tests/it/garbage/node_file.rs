@@ -71,13 +71,16 @@ fn files_that_are_none_are_faults_of_the_configuration() {
     let folder = tempfile::tempdir().unwrap();
     let kafka = "layer: { name: fog, kind: fog }\nnode: { name: server-1 }\nbrokers:\n  \
                  layer: { kafka: { bootstrap: [\"127.0.0.1:9\"], properties: { acks: \"1\" } } }\n";
-    for (name, content, place) in [
-        ("empty", "", ""),
-        ("syntax", "a: [1\nb: }", ""),
-        ("kafka", kafka, ":4: brokers.layer.kafka.properties.acks: "),
+    let password = "layer: { name: fog, kind: fog }\nnode: { name: server-1 }\nbrokers: { node: { memory: {} } }\n\
+                    database: { mongodb: { uri: \"mongodb://me@h\",\n  password_file: /nowhere/password } }\n";
+    for (program, name, content, place) in [
+        ("blaze-flow", "empty", "", ""),
+        ("blaze-flow", "syntax", "a: [1\nb: }", ""),
+        ("blaze-flow", "kafka", kafka, ":4: brokers.layer.kafka.properties.acks: "),
+        ("blaze-worker", "password", password, ":5: database.mongodb.password_file: "),
     ] {
         let path = written(folder.path(), name, content);
-        let (code, _, faults) = output("blaze-flow", &["--config", &path, "--check"], &[]);
+        let (code, _, faults) = output(program, &["--config", &path, "--check"], &[]);
         assert_eq!(code, Some(64), "{name}: {faults}");
         assert!(faults.starts_with(&format!("{path}{place}")), "{name}: {faults}");
     }

@@ -11,6 +11,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use blaze_config::store::migrate::{Action, Migration, Migrations, Step};
 use blaze_config::store::{AuditQuery, FullStore, MongoStore, Op, SqliteStore, StoreError};
 use blaze_domain::config::{Document, Key, Timestamp};
+use blaze_domain::node_file::MongoSection;
 use blaze_runtime::Supervisor;
 use blaze_tests::servers::{
     drop_mongo_database, mongo_command, mongo_insert, shared_mongo, unique_name,
@@ -41,7 +42,9 @@ async fn open(place: &str, migrations: &Migrations) -> Result<Arc<dyn FullStore>
             SqliteStore::open_with(Path::new(place), migrations, &Supervisor::new("test")).await?;
         return Ok(Arc::new(store));
     }
-    let store = MongoStore::open_with(&shared_mongo().unwrap(), place, migrations).await?;
+    let store =
+        MongoStore::open_with(&MongoSection::of(&shared_mongo().unwrap(), place), migrations)
+            .await?;
     Ok(Arc::new(store))
 }
 
@@ -66,7 +69,13 @@ impl Home {
     async fn pending(&self, migrations: &Migrations) -> Vec<String> {
         let plan = match self.is_file() {
             true => SqliteStore::plan(Path::new(&self.place), migrations).await,
-            false => MongoStore::plan(&shared_mongo().unwrap(), &self.place, migrations).await,
+            false => {
+                MongoStore::plan(
+                    &MongoSection::of(&shared_mongo().unwrap(), &self.place),
+                    migrations,
+                )
+                .await
+            }
         };
         plan.unwrap().pending
     }

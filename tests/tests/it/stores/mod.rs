@@ -7,6 +7,7 @@ mod alone;
 mod killed;
 mod migrations;
 mod outages;
+mod passwords;
 mod refused;
 mod rules;
 mod support;

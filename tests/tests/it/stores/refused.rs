@@ -3,11 +3,12 @@
 use std::time::{Duration, Instant};
 
 use blaze_config::store::{MongoStore, StoreError};
+use blaze_domain::node_file::MongoSection;
 use blaze_tests::servers::{MongoOptions, MongoServer};
 use blaze_tests::within;
 
 async fn refusal(uri: &str, database: &str) -> StoreError {
-    MongoStore::open(uri, database).await.err().unwrap()
+    MongoStore::open(&MongoSection::of(uri, database)).await.err().unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

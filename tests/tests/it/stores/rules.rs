@@ -5,6 +5,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use blaze_config::store::{Archive as _, CommitLog as _, FullStore, MongoStore, SqliteStore};
 use blaze_conformance::store::Fixture;
+use blaze_domain::node_file::MongoSection;
 use blaze_runtime::Supervisor;
 use blaze_tests::servers::{drop_mongo_database, mongo_command, shared_mongo, unique_name};
 use parking_lot::Mutex;
@@ -31,7 +32,7 @@ impl Fixture for Databases {
     async fn open(&self, name: &str) -> Arc<dyn FullStore> {
         let database = format!("rules_{name}");
         self.made.lock().push(database.clone());
-        let store = MongoStore::open(&self.uri, &database).await.unwrap();
+        let store = MongoStore::open(&MongoSection::of(&self.uri, &database)).await.unwrap();
         Arc::new(if self.in_a_hurry { store.in_a_hurry() } else { store })
     }
 
@@ -93,7 +94,8 @@ async fn documents_follow_the_log_when_it_was_set_back() {
     for written in [2, 3] {
         let name = unique_name("set-back");
         databases.made.lock().push(name.clone());
-        let store = MongoStore::open(&databases.uri, &name).await.unwrap().in_a_hurry();
+        let store =
+            MongoStore::open(&MongoSection::of(&databases.uri, &name)).await.unwrap().in_a_hurry();
         store.tidy().await.unwrap();
         for revision in 1..=written {
             let record = record(revision, &format!("batch-{revision}"));
@@ -106,7 +108,7 @@ async fn documents_follow_the_log_when_it_was_set_back() {
         });
         mongo_command(&databases.uri, &name, &gone).unwrap();
         store.tidy().await.unwrap();
-        let other = MongoStore::open(&databases.uri, &name).await.unwrap();
+        let other = MongoStore::open(&MongoSection::of(&databases.uri, &name)).await.unwrap();
         let loaded = other.load().await.unwrap();
         found.push((loaded.revision, loaded.documents.len()));
     }
@@ -121,7 +123,7 @@ async fn records_below_the_floor_are_removed() {
     for (in_a_hurry, after_six, after_nine) in [(false, 9, 9), (true, 3, 1)] {
         let name = unique_name("removed");
         databases.made.lock().push(name.clone());
-        let store = MongoStore::open(&databases.uri, &name).await.unwrap();
+        let store = MongoStore::open(&MongoSection::of(&databases.uri, &name)).await.unwrap();
         let store = if in_a_hurry { store.in_a_hurry() } else { store };
         for revision in 1..=9 {
             let record = record(revision, &format!("batch-{revision}"));

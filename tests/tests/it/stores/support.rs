@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use blaze_config::store::{Change, Commit, CommitError, CommitLog, CommitRecord, MongoStore, Op};
 use blaze_domain::config::{Document, Timestamp};
+use blaze_domain::node_file::MongoSection;
 use blaze_tests::servers::{MongoOptions, MongoServer, unique_name};
 use serde_json::json;
 
@@ -14,7 +15,7 @@ pub(crate) fn server() -> MongoServer {
 }
 
 pub(crate) async fn store(server: &MongoServer) -> MongoStore {
-    MongoStore::open(&server.uri(), "blaze_test").await.unwrap()
+    MongoStore::open(&MongoSection::of(&server.uri(), "blaze_test")).await.unwrap()
 }
 
 /// A commit of a document that everybody changes, and of one that it makes.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::redis::RedisKeys;
-use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
+use blaze_domain::node_file::{LayerBroker, MongoSection, NodeBroker, NodeFile};
 use blaze_tests::servers::{
     KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer,
     drop_mongo_database, shared_mongo, unique_name,
@@ -37,8 +37,8 @@ fn keys_on(server: &RedisServer) -> Arc<RedisKeys> {
 
 async fn run_on_mongo(uri: &str, database: &str) -> Result<(), String> {
     let lease = |layer: &str, owner: &str| -> Arc<dyn Lease> {
-        let (layer, uri) = (layer.parse().unwrap(), uri.to_owned().into());
-        Arc::new(MongoLease::new(uri, database, layer, owner.to_owned()).unwrap())
+        let section = MongoSection::of(uri, database);
+        Arc::new(MongoLease::new(section, layer.parse().unwrap(), owner.to_owned()).unwrap())
     };
     run_all(&lease, BUSY).await
 }
