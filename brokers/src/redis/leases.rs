@@ -206,9 +206,9 @@ impl Leases {
         Arc::clone(&self.ledger.lock().hash)
     }
 
-    /// Whether the server is to have any.
-    pub(super) fn has_any(&self) -> bool {
-        !self.ledger.lock().kept.is_empty()
+    /// How many the server is to have.
+    pub(super) fn count(&self) -> usize {
+        self.ledger.lock().kept.len()
     }
 
     /// Writes all again: the server has lost them.

@@ -36,7 +36,7 @@ async fn look_on(shared: &Shared, leases: Option<&Leases>) {
         if leases.is_none() && !evictions.are_seen(connection.clone()).await {
             continue;
         }
-        let mut missing = match missing(connection, &kept(shared, leases)).await {
+        let mut missing = match missing(connection, &kept(shared, leases), leases).await {
             Ok(missing) => missing,
             Err(error) => {
                 tracing::debug!(%error, "redis does not tell what it has kept");
@@ -70,7 +70,7 @@ fn kept(shared: &Shared, leases: Option<&Leases>) -> Vec<Arc<str>> {
         return Vec::new();
     }
     let mut keys = shared.mirror.lock().hashes();
-    keys.extend(leases.filter(|leases| leases.has_any()).map(Leases::hash));
+    keys.extend(leases.filter(|leases| leases.count() > 0).map(Leases::hash));
     keys
 }
 
@@ -93,9 +93,12 @@ impl Evictions {
     }
 }
 
+/// The keys that are not there, or lack some of the leases: one that is written after the others
+/// have vanished makes their key anew.
 async fn missing(
     mut connection: MultiplexedConnection,
     keys: &[Arc<str>],
+    leases: Option<&Leases>,
 ) -> RedisResult<HashSet<Arc<str>>> {
     let mut missing = HashSet::new();
     for some in keys.chunks(PER_BATCH) {
@@ -106,6 +109,13 @@ async fn missing(
         let found: Vec<bool> = asked.query_async(&mut connection).await?;
         missing
             .extend(some.iter().zip(found).filter(|(_, found)| !found).map(|(key, _)| key.clone()));
+    }
+    if let Some(leases) = leases.filter(|leases| keys.contains(&leases.hash())) {
+        let hash = leases.hash();
+        let there: usize = redis::cmd("HLEN").arg(&*hash).query_async(&mut connection).await?;
+        if there < leases.count() {
+            missing.insert(hash);
+        }
     }
     Ok(missing)
 }
