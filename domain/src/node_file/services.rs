@@ -161,7 +161,7 @@ impl MongoSection {
 fn names_user_alone(uri: &str) -> bool {
     let place = uri.split_once("://").map_or(uri, |(_, place)| place);
     let hosts = place.split(['/', '?']).next().unwrap_or_default();
-    hosts.rsplit_once('@').is_some_and(|(user, _)| !user.is_empty() && !user.contains(':'))
+    hosts.rsplit_once('@').is_some_and(|(user, _)| !user.is_empty() && !user.contains([':', '@']))
 }
 
 /// `monitor`.

@@ -275,7 +275,13 @@ fn a_password_of_mongodb_belongs_to_a_user_of_the_uri() {
         assert_eq!(whole.reveal(), uri.replacen('@', ":p%40%3A%2F%25%C3%A4@", 1));
         assert_eq!(section.uri_with(None).reveal(), uri);
     }
-    for uri in ["mongodb://h:1", "mongodb://me:geheim@h", "mongodb://@h", "mongodb://h/?x=a@b"] {
+    for uri in [
+        "mongodb://h:1",
+        "mongodb://me:geheim@h",
+        "mongodb://@h",
+        "mongodb://m@e@h",
+        "mongodb://h/?x=a@b",
+    ] {
         let found = faults(&tree(uri));
         assert!(found.len() == 2 && !found[0].contains("geheim"), "{uri}: {found:?}");
         assert!(found.iter().all(|fault| fault.contains("mongodb://USER@HOST")), "{found:?}");

@@ -1,6 +1,7 @@
 //! The connection to MongoDB: made at the first use, and limited in everything.
 
 use std::future::IntoFuture;
+use std::mem::Discriminant;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -52,8 +53,8 @@ struct Connected {
     trying: JoinSet<Result<LoggedIn, CopyError>>,
     /// When that is tried next, at the earliest.
     again: Instant,
-    /// Whether it was said that it does not work.
-    is_told: bool,
+    /// Which kind of error was said last.
+    told: Option<Discriminant<CopyError>>,
 }
 
 impl Connected {
@@ -62,7 +63,7 @@ impl Connected {
     fn follow(&mut self, server: &Server, password: Result<Option<SecretText>, CopyError>) {
         match self.trying.try_join_next() {
             Some(Ok(Ok((tables, password)))) => {
-                (self.tables, self.password, self.is_told) = (tables, password, false);
+                (self.tables, self.password, self.told) = (tables, password, None);
                 tracing::info!(place = server.place, "logged in with another password");
             }
             Some(Ok(Err(error))) => self.tell(&error),
@@ -82,7 +83,9 @@ impl Connected {
     }
 
     fn tell(&mut self, error: &CopyError) {
-        if !std::mem::replace(&mut self.is_told, true) {
+        // Not by its text: that of a server that is away changes from look to look.
+        let kind = std::mem::discriminant(error);
+        if self.told.replace(kind) != Some(kind) {
             tracing::warn!(%error, "the password of MongoDB that the file holds is not used");
         }
     }
@@ -136,8 +139,8 @@ impl Server {
         }
         let password = password?;
         let tables = self.connect(password.as_ref()).await?;
-        let (again, is_told, trying) = (Instant::now(), false, JoinSet::new());
-        *held = Some(Connected { tables: tables.clone(), password, trying, again, is_told });
+        let (again, told, trying) = (Instant::now(), None, JoinSet::new());
+        *held = Some(Connected { tables: tables.clone(), password, trying, again, told });
         Ok(tables)
     }
 

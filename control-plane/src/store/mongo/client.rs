@@ -44,7 +44,8 @@ pub(super) struct Connection {
 
 impl Connection {
     /// # Errors
-    /// As [`Tables::connect`]; a password file that cannot be read is [`StoreError::Refused`].
+    /// As [`Tables::connect`]; with a password file that cannot be read, [`StoreError::Unavailable`]:
+    /// it may just be written.
     pub(super) async fn open(section: &MongoSection) -> Result<Self, StoreError> {
         let password = read(section.password_file.as_deref()).await?;
         let tables = Tables::connect(section, password).await?;
@@ -79,7 +80,7 @@ async fn read(file: Option<&Path>) -> Result<Option<SecretText>, StoreError> {
     };
     match tokio::task::spawn_blocking(move || read_password(&file)).await {
         Ok(Ok(password)) => Ok(Some(password.into())),
-        Ok(Err(error)) => Err(StoreError::Refused(error)),
+        Ok(Err(error)) => Err(StoreError::Unavailable(error)),
         // The runtime goes away.
         Err(error) => Err(StoreError::Unavailable(error.to_string())),
     }

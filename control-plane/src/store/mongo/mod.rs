@@ -208,11 +208,11 @@ impl MongoStore {
     /// Connects anew whenever the file of the password holds another one, for ever. Until the
     /// server takes that, the connections of before serve.
     pub async fn follow_password(&self) {
-        let mut is_told = false;
+        let mut told = None;
         loop {
             pause(PASSWORD_LOOK).await;
             match self.connection.connect_anew().await {
-                Ok(None) => is_told = false,
+                Ok(None) => told = None,
                 Ok(Some(tables)) => {
                     {
                         // A session is of the client that made it.
@@ -224,14 +224,16 @@ impl MongoStore {
                     self.stream.lock().await.take();
                     tracing::info!("connected to MongoDB with another password");
                 }
-                Err(error) if !is_told => {
-                    is_told = true;
-                    tracing::warn!(
-                        %error,
-                        "the password of MongoDB that the file holds is not used",
-                    );
+                Err(error) => {
+                    // Not by its text: that of a server that is away changes from look to look.
+                    let kind = std::mem::discriminant(&error);
+                    if told.replace(kind) != Some(kind) {
+                        tracing::warn!(
+                            %error,
+                            "the password of MongoDB that the file holds is not used",
+                        );
+                    }
                 }
-                Err(_) => {}
             }
         }
     }
