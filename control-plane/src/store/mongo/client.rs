@@ -78,12 +78,10 @@ async fn read(file: Option<&Path>) -> Result<Option<SecretText>, StoreError> {
     let Some(file) = file.map(Path::to_owned) else {
         return Ok(None);
     };
-    match tokio::task::spawn_blocking(move || read_password(&file)).await {
-        Ok(Ok(password)) => Ok(Some(password.into())),
-        Ok(Err(error)) => Err(StoreError::Unavailable(error)),
-        // The runtime goes away.
-        Err(error) => Err(StoreError::Unavailable(error.to_string())),
-    }
+    let read = tokio::task::spawn_blocking(move || read_password(&file)).await;
+    // The blocking task ends early only when the runtime goes away.
+    let password = read.unwrap_or_else(|error| Err(error.to_string()));
+    password.map(|password| Some(password.into())).map_err(StoreError::Unavailable)
 }
 
 /// The collections of a store. All of them read what no crash can take back, and write so that no

@@ -169,7 +169,6 @@ impl MongoStore {
         first: &EventRow,
         proof: Proof,
     ) -> Result<(), CommitError> {
-        let tables = self.tables();
         let until = Instant::now() + LIMIT;
         let command = doc! {
             "insert": "events", "documents": [record],
@@ -188,7 +187,7 @@ impl MongoStore {
             Tried::Written => return Ok(()),
             Tried::Taken => return Err(CommitError::Conflict),
             Tried::Held => {
-                stale::end_idle_transactions(&tables).await;
+                stale::end_idle_transactions(&self.tables()).await;
                 return Err(CommitError::Conflict);
             }
             Tried::Failed(error) => return Err(CommitError::NotWritten(error)),
@@ -261,7 +260,6 @@ impl MongoStore {
         first: &EventRow,
         proof: Proof,
     ) -> Result<(), CommitError> {
-        let tables = self.tables();
         // Always the same session: a transaction on it ends what an earlier one may have left open
         // on the server.
         let mut place = self.session.lock().await;
@@ -281,7 +279,7 @@ impl MongoStore {
         *place = Some(session);
         drop(place);
         if self.is_held_for_long(first.revision, held) {
-            stale::end_idle_transactions(&tables).await;
+            stale::end_idle_transactions(&self.tables()).await;
         }
         done
     }

@@ -92,7 +92,7 @@ fn write(file: &Path, password: &str) {
     std::fs::rename(new, file).unwrap();
 }
 
-/// Whether the program logs in with the password of now: the server ends the connections of before.
+/// Has the server end the connections of before, and waits until both have logged in anew.
 async fn reconnects(users: &mut Users, server: &MongoServer) {
     server.restart().unwrap();
     users.write_soon().await;
