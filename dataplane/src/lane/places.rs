@@ -143,6 +143,7 @@ impl DataCore {
             };
             // What is kept is older than what another bridge has held for this one.
             let passed_on = bridge.held.as_mut().map(std::mem::take);
+            let newer_waits = passed_on.is_some() || bridge.in_codec > 0;
             let mut passed = Vec::new();
             for message in self.kept.of(now, topic, bridge.from) {
                 // The rules may have changed since it came.
@@ -154,8 +155,8 @@ impl DataCore {
                 }
             }
             for (frame, lanes) in passed {
-                // From the codec it would come back behind what is held.
-                if passed_on.is_some() {
+                // From the codec it would come back behind what is held or is there already.
+                if newer_waits {
                     self.put_to_lanes(now, topic, lanes, link);
                 } else {
                     self.compress_out(now, topic, &frame, lanes, Arrival::Kept, link);

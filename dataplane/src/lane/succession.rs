@@ -134,7 +134,7 @@ impl Succession {
     /// What the receiver of a bridge that drains has got is to be written before another one goes
     /// on.
     pub(super) fn await_written(&mut self, now: Instant, topic: TopicId, bridge: &mut BridgeState) {
-        // What is with the codec will be given to its lane.
+        // What is with the codec will be given to its lane, where no bridge here goes on.
         let was_used = bridge.submitted || bridge.in_codec > 0;
         if self.leaving || !was_used || bridge.unwritten.is_some() {
             return;
@@ -379,21 +379,25 @@ impl DataCore {
         }
     }
 
-    /// What bridges held that are not planned any more goes to those that go on. Where nobody does
-    /// it stays with them, until they are planned again or have drained.
+    /// What waits here for bridges that are not planned any more, held or with the codec, goes to
+    /// those that go on: so all of a writer that has not been sent yet has one way, and stays in
+    /// order. Where nobody goes on it stays with them, until they are planned again or have
+    /// drained.
     pub(super) fn pass_on(&mut self, topic: TopicId) {
         let bridges = &mut self.topics[topic.0 as usize].bridges;
         for at in 0..bridges.len() {
-            if bridges[at].held.is_none() || !bridges[at].is_draining() {
+            let waits = bridges[at].held.is_some() || bridges[at].in_codec > 0;
+            if !waits || matches!(bridges[at].phase, Phase::Up { .. }) {
                 continue;
             }
             let goes_on = |bridge: &BridgeState| {
                 matches!(bridge.phase, Phase::Up { .. }) && bridge.is_beside(&bridges[at])
             };
             if let Some(heir) = bridges.iter().position(goes_on) {
-                let mut held = bridges[at].held.take().unwrap_or_default();
-                held.append(bridges[heir].held.take());
-                bridges[heir].held = Some(held);
+                if let Some(mut held) = bridges[at].held.take() {
+                    held.append(bridges[heir].held.take());
+                    bridges[heir].held = Some(held);
+                }
                 // What of its messages is with the codec comes behind these.
                 let moved = self.compress.hand_over(topic, at, heir);
                 bridges[at].in_codec = bridges[at].in_codec.saturating_sub(moved);

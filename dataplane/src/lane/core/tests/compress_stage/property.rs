@@ -136,15 +136,19 @@ impl Hands {
         self.check();
     }
 
-    /// The sequences that each lane got of each writer, in the order in which they came.
-    fn by_lane(&mut self) -> HashMap<(u32, u8), Vec<u64>> {
-        let mut found: HashMap<(u32, u8), Vec<u64>> = HashMap::new();
+    /// The sequences that each layer got of each writer, in the order in which they were sent:
+    /// receivers of one layer write to one broker.
+    fn by_layer(&mut self) -> HashMap<(String, u8), Vec<u64>> {
+        let mut found: HashMap<(String, u8), Vec<u64>> = HashMap::new();
         for (lane, writer, sequence) in self.sent() {
-            found.entry((lane, writer)).or_default().push(sequence);
+            let mut bridges = self.path().bridges.iter();
+            let bridge = bridges.find(|bridge| bridge.lane_id() == Some(LaneId(lane))).unwrap();
+            let (layer, _) = bridge.receiver().unwrap();
+            found.entry((layer.to_string(), writer)).or_default().push(sequence);
         }
         for (of, sequences) in &found {
             let ascend = sequences.windows(2).all(|pair| pair[0] < pair[1]);
-            assert!(ascend, "lane and writer {of:?}: {sequences:?}");
+            assert!(ascend, "layer and writer {of:?}: {sequences:?}");
         }
         found
     }
@@ -169,11 +173,11 @@ proptest! {
         let taken: Vec<u64> =
             hands.path().bridges.iter().map(|bridge| bridge.stats.taken.messages).collect();
         prop_assert_eq!(taken, [published; 3]);
-        let sent = hands.by_lane();
+        let sent = hands.by_layer();
         if reliable {
             // What is to be compressed does not exceed what may wait.
             for (writer, last) in &seen.published {
-                let of_writer = sent.get(&(0, *writer)).cloned().unwrap_or_default();
+                let of_writer = sent.get(&("cloud".to_owned(), *writer)).cloned().unwrap_or_default();
                 prop_assert_eq!(of_writer, (1..=*last).collect::<Vec<u64>>());
             }
             prop_assert!(hands.dropped(0).is_empty() && hands.dropped(2).is_empty());
@@ -195,6 +199,6 @@ proptest! {
         }
         hands.step(&Step::Plan(2), &mut seen);
         hands.come_to_rest();
-        hands.by_lane();
+        hands.by_layer();
     }
 }

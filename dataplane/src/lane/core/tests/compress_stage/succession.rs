@@ -32,21 +32,52 @@ impl Hands {
     }
 }
 
-/// It was given to its lane, as far as anybody can see, though the link has not got it.
+/// The receiver before has got nothing of it, so it goes on with the topic.
 #[test]
-fn the_next_receiver_waits_for_what_is_with_the_codec() {
+fn what_is_with_the_codec_goes_to_the_next_receiver() {
     let mut hands = Hands::new(to("a"));
     hands.publish(1, 1, LARGE);
     hands.plan(to("b"));
+    hands.publish(1, 2, 100);
     hands.publish(2, 1, 100);
-    assert_eq!(hands.sent(), [], "the first message is not there yet");
+    assert_eq!(hands.sent(), [(1, 2, 1)], "nothing was sent before it");
+    hands.run();
+    assert_eq!(hands.sent(), [(1, 1, 1), (1, 1, 2)]);
+    assert!(hands.bench.link.told.is_empty(), "`a` has nothing to write");
+    assert_eq!(hands.taken(), [0, 3]);
+}
+
+#[test]
+fn it_waits_there_for_what_was_sent_before() {
+    let mut hands = Hands::new(to("a"));
+    hands.publish(1, 1, 100);
+    hands.publish(1, 2, LARGE);
+    hands.plan(to("b"));
+    hands.publish(1, 3, 100);
     hands.run();
     assert_eq!(hands.sent(), [(0, 1, 1)]);
-    assert!(hands.bench.link.told.is_empty());
     hands.link_is_empty();
-    assert_eq!(hands.sent(), []);
     hands.answer("a");
-    assert_eq!(hands.sent(), [(1, 2, 1)]);
+    assert_eq!(hands.sent(), [(1, 1, 2), (1, 1, 3)]);
+}
+
+/// Messages of one writer were with the codec for both receivers.
+#[test]
+fn a_topic_that_comes_and_goes_stays_in_order() {
+    let mut hands = Hands::new(to("a"));
+    hands.publish(1, 1, 100);
+    hands.publish(1, 2, LARGE);
+    hands.plan(to("b"));
+    hands.publish(1, 3, 100);
+    // Nobody goes on until `b` has ended.
+    hands.plan(Vec::new());
+    hands.pass(DRAIN);
+    hands.plan(to("a"));
+    hands.publish(1, 4, 100);
+    hands.run();
+    hands.link_is_empty();
+    assert_eq!(hands.sent(), [(0, 1, 1), (0, 1, 2), (0, 1, 3), (0, 1, 4)]);
+    assert_eq!(hands.taken(), [4, 0]);
 }
 
 /// Message 1 went to `a`, which has not said that it has written it; 2 is held for `b`, and 3 is
@@ -198,4 +229,20 @@ fn what_is_kept_goes_before_what_is_held() {
     hands.answer("a");
     let sequences: Vec<u64> = hands.sent().iter().map(|(.., sequence)| *sequence).collect();
     assert_eq!(sequences, [1, 2, 2], "its receiver drops what it has");
+}
+
+/// … and than what is with the codec.
+#[test]
+fn what_is_kept_goes_before_what_is_with_the_codec() {
+    let mut hands = Hands::new(durable("a"));
+    for sequence in 1..=2 {
+        hands.bench.take(Scope::Node, vec![kept(sequence, LARGE, 2)]);
+        hands.look();
+    }
+    hands.plan(durable("b"));
+    let Bench { core, link, now, topic, .. } = &mut hands.bench;
+    core.deliver_waiting(*now, *topic, link);
+    hands.look();
+    hands.run();
+    assert_eq!(hands.sent(), [(1, 1, 1), (1, 1, 2), (1, 1, 1), (1, 1, 2)]);
 }
