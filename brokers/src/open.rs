@@ -158,6 +158,7 @@ mod tests {
         let secret = json!({ "url": "redis://h", "password_file": "/nowhere/password" });
         for (tree, path) in [
             (node("redis://h:99999"), "brokers.node.redis.url"),
+            (node("redis://h:0"), "brokers.node.redis.url"),
             (node("redis://h/first"), "brokers.node.redis.url"),
             // Channels are the same ones in all databases.
             (node("redis://h/1"), "brokers.node.redis.url"),

@@ -97,7 +97,10 @@ fn main() -> ExitCode {
     };
     let checked = if arguments.check { setup.check_all() } else { setup.check() };
     if let Err(faults) = checked {
-        faults.iter().for_each(|fault| say(format_args!("{fault}")));
+        for fault in faults {
+            let (path, detail) = fault.split_once(": ").unwrap_or(("", &fault));
+            say(format_args!("{}", loaded.document.fault(path, detail)));
+        }
         return ExitCode::from(exit_code::CONFIGURATION);
     }
     if arguments.check {

@@ -73,6 +73,12 @@ impl Setup {
                     .to_owned(),
             );
         }
+        #[cfg(feature = "mongodb")]
+        if let StoreSection::MongoDb(section) = &self.section.store
+            && let Err(fault) = store::mongo::check_uri(section)
+        {
+            faults.push(format!("control_plane.store.mongodb.uri: {fault}"));
+        }
         if let StoreSection::MongoDb(MongoSection { password_file: Some(file), .. }) =
             &self.section.store
             && let Err(fault) = read_password(file)
@@ -318,7 +324,7 @@ mod tests {
         section.tls.client_ca_file = Some(path("nope.ca"));
         section.store = StoreSection::MongoDb(MongoSection {
             password_file: Some(path("nope.pw")),
-            ..MongoSection::of("mongodb://me@h", "x")
+            ..MongoSection::of("mongodb://me@h/?nonsense=x", "x")
         });
         let found = setup(section).check_all().unwrap_err();
         for (place, part) in [
@@ -332,12 +338,14 @@ mod tests {
             ("control_plane.tls.key_file: ", "nope.pem cannot be read"),
             ("control_plane.tls.client_ca_file: ", "nope.ca cannot be read"),
             ("control_plane.store.mongodb.password_file: ", "nope.pw: No such file"),
+            #[cfg(feature = "mongodb")]
+            ("control_plane.store.mongodb.uri: ", "nonsense is an invalid option"),
         ] {
             let matching =
                 found.iter().filter(|fault| fault.starts_with(place) && fault.contains(part));
             assert_eq!(matching.count(), 1, "{place}{part} in {found:#?}");
         }
-        assert_eq!(found.len(), 10, "{found:#?}");
+        assert_eq!(found.len(), 11, "{found:#?}");
     }
 
     #[test]

@@ -45,7 +45,7 @@ fn mongodb(
     vault: &Vault,
 ) -> anyhow::Result<Arc<dyn LocalCopy>> {
     let (layer, node) = (settings.site.layer.clone(), settings.site.node.as_ref());
-    let copy = crate::copy::MongoCopy::new(section, layer, node, vault.clone())?;
+    let copy = crate::copy::MongoCopy::new(section, layer, node, vault.clone());
     Ok(Arc::new(copy))
 }
 

@@ -80,6 +80,12 @@ fn main() -> ExitCode {
 fn schema(at_start: bool) -> Schema<NodeFile> {
     node_schema(move |file| {
         let mut faults = WorkerSettings::of(file).err().unwrap_or_default();
+        #[cfg(feature = "mongodb")]
+        if let Some(DatabaseSection::MongoDb(section)) = &file.database
+            && let Err(detail) = blaze_worker::copy::check_uri(section)
+        {
+            faults.push(Fault { path: "database.mongodb.uri".to_owned(), detail });
+        }
         if at_start
             && let Some(DatabaseSection::MongoDb(section)) = &file.database
             && let Some(Err(detail)) = section.password_file.as_deref().map(read_password)

@@ -300,11 +300,24 @@ fn auto_bool(node: &Node<'_>) -> Option<AutoBool> {
 fn url(schemes: &'static [&'static str]) -> impl Fn(&Node<'_>) -> Option<SecretText> {
     move |node| {
         let text = readers::text(node)?;
-        match schemes.iter().find_map(|scheme| text.strip_prefix(scheme)) {
-            Some(rest) if !rest.is_empty() && !rest.contains(char::is_whitespace) => {
-                Some(SecretText(text))
-            }
-            _ => node.fault(format!("is not a URL that starts with {}", schemes.join(" or "))),
+        let rest = schemes.iter().find_map(|scheme| text.strip_prefix(scheme)).unwrap_or_default();
+        if rest.is_empty() || rest.contains(char::is_whitespace) {
+            return node.fault(format!("is not a URL that starts with {}", schemes.join(" or ")));
         }
+        if !has_ports_that_are_some(rest) {
+            return node.fault("names a port that is none: 1 to 65535 are");
+        }
+        Some(SecretText(text))
     }
+}
+
+/// Whether the ports of the hosts of a URL can be ones, as far as it has any.
+fn has_ports_that_are_some(rest: &str) -> bool {
+    let place = rest.split(['/', '?', '#']).next().unwrap_or_default();
+    let hosts = place.rsplit_once('@').map_or(place, |(_, hosts)| hosts);
+    hosts.split(',').all(|host| match host.rsplit_once(':') {
+        // The colons of an IPv6 address stand in brackets.
+        Some((_, port)) if !port.ends_with(']') => port.parse::<u16>().is_ok_and(|port| port > 0),
+        _ => true,
+    })
 }

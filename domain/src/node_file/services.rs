@@ -4,7 +4,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
-use super::readers::{formed, parsed, path, text, whole};
+use super::readers::{formed, parsed, path, whole};
 use super::walk::{Node, Section, from_empty};
 use super::{AutoBool, RedisBroker, SecretText, auto_bool, url};
 use crate::names::TopicName;
@@ -145,7 +145,7 @@ impl MongoSection {
 
     pub(super) fn section(s: &mut Section<'_>, default: &str) -> Option<Self> {
         let uri: Option<SecretText> = s.need("uri", url(&["mongodb://", "mongodb+srv://"]));
-        let database = s.or("database", text, default.to_owned());
+        let database = s.or("database", database_name, default.to_owned());
         let password_file = s.opt("password_file", path);
         let uri = uri?;
         if password_file.is_some() && !names_user_alone(uri.reveal()) {
@@ -155,6 +155,15 @@ impl MongoSection {
         }
         Some(Self { uri, database, password_file })
     }
+}
+
+/// Less than MongoDB takes, so that it can stand in a URI, a log line and a metric as it is.
+fn database_name(node: &Node<'_>) -> Option<String> {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
+    formed("the name of a database: 1 to 63 of A-Z, a-z, 0-9, _ and -", |name| {
+        let is_one = (1..=63).contains(&name.len()) && name.chars().all(allowed);
+        is_one.then(|| name.to_owned())
+    })(node)
 }
 
 /// Whether a URI has a user and no password.

@@ -263,6 +263,57 @@ fn a_password_of_kafka_stands_in_one_place() {
 }
 
 #[test]
+fn ports_of_urls_are_checked() {
+    let of = |redis: &str, server: &str, mongodb: &str| {
+        json!({
+            "layer": { "name": "edge", "kind": "edge" },
+            "node": { "name": "robot-1" },
+            "brokers": { "node": { "redis": { "url": redis } } },
+            "config": { "server": server },
+            "database": { "mongodb": { "uri": mongodb } },
+        })
+    };
+    for (redis, server, mongodb) in [
+        ("redis://h", "https://h", "mongodb://h,i"),
+        ("redis://u:0@h:1/2", "https://h:65535/", "mongodb://u:p@h:1,[::1]:2/x?y=z:0"),
+        ("unix:///run/a:0", "http://[::1]", "mongodb+srv://h"),
+    ] {
+        NodeFile::read(&of(redis, server, mongodb)).unwrap();
+    }
+    for (redis, server, mongodb) in [
+        ("redis://h:0", "https://h:0", "mongodb://h:0"),
+        ("redis://u:1@h:65536", "http://h:99999/x", "mongodb://h:1,i:0"),
+        ("redis://h:", "https://h:x", "mongodb://[::1]:0"),
+    ] {
+        let found = faults(&of(redis, server, mongodb));
+        let places: Vec<_> = found.iter().filter_map(|fault| fault.split(": ").next()).collect();
+        assert_eq!(
+            places,
+            ["brokers.node.redis.url", "config.server", "database.mongodb.uri"],
+            "{found:?}"
+        );
+    }
+}
+
+#[test]
+fn names_of_databases_are_checked() {
+    let found = |name: &str| {
+        let database = json!({ "mongodb": { "uri": "mongodb://h", "database": name } });
+        faults(&json!({ "database": database, "control_plane": { "store": database } }))
+    };
+    for right in ["blaze_main-2", &"x".repeat(63)] {
+        let store = json!({ "mongodb": { "uri": "mongodb://h", "database": right } });
+        NodeFile::read(&json!({ "database": store })).unwrap();
+    }
+    for wrong in ["", "a/b", "a.b", "$cmd", "ä", "a b", &"x".repeat(64)] {
+        let found = found(wrong);
+        assert_eq!(found.len(), 2, "{wrong}: {found:?}");
+        assert!(found[0].starts_with("database.mongodb.database: "), "{found:?}");
+        assert!(found[1].starts_with("control_plane.store.mongodb.database: "), "{found:?}");
+    }
+}
+
+#[test]
 fn a_password_of_mongodb_belongs_to_a_user_of_the_uri() {
     let tree = |uri: &str| {
         let store = json!({ "mongodb": { "uri": uri, "password_file": "/f" } });

@@ -46,9 +46,9 @@ impl Subject {
         match &self.kind {
             Kind::File => Box::new(FileCopy::new(self.folder.path(), layer, vault)),
             #[cfg(feature = "mongodb")]
-            Kind::Mongo { uri, database } => Box::new(
-                super::MongoCopy::new(MongoSection::of(uri, database), layer, None, vault).unwrap(),
-            ),
+            Kind::Mongo { uri, database } => {
+                Box::new(super::MongoCopy::new(MongoSection::of(uri, database), layer, None, vault))
+            }
         }
     }
 
@@ -215,8 +215,7 @@ mod in_mongodb {
                     layer,
                     None,
                     vault,
-                )
-                .unwrap();
+                );
                 copy.replace(&sample(revision)).await.unwrap();
                 let head = tables.collection::<Document>("head").find_one(doc! {}).await.unwrap();
                 let chunks = tables.collection::<Document>("chunks").find(doc! {}).await.unwrap();

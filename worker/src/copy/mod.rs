@@ -58,6 +58,8 @@ pub use error::CopyError;
 pub use file::{FILE_NAME, FileCopy};
 #[cfg(feature = "mongodb")]
 pub use mongo::MongoCopy;
+#[cfg(feature = "mongodb")]
+pub use mongo_client::check_uri;
 pub use notes::Notes;
 pub use start::{Start, choose};
 pub use vault::Vault;

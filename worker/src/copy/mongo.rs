@@ -48,26 +48,24 @@ pub struct MongoCopy {
 
 impl MongoCopy {
     /// The copy of a layer's worker, or of the worker of one of its nodes.
-    ///
-    /// # Errors
-    /// [`CopyError::Refused`] for a name that no database can have.
+    #[must_use]
     pub fn new(
         section: MongoSection,
         layer: LayerName,
         node: Option<&NodeName>,
         vault: Vault,
-    ) -> Result<Self, CopyError> {
+    ) -> Self {
         // Names have no dot and no slash: no two copies have one name, and no name begins as the
         // chunks of another copy do.
         let copy = node.map_or_else(|| layer.to_string(), |node| format!("{layer}.{node}"));
         let place = format!("MongoDB {}, copy {copy}", section.database);
-        Ok(Self {
-            server: Server::new(section, &copy, &place)?,
+        Self {
+            server: Server::new(section, &copy, &place),
             place,
             copy,
             layer,
             vault: Arc::new(vault),
-        })
+        }
     }
 
     /// The head record. `preference`: which members may answer; at the start also one that is not

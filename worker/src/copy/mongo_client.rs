@@ -10,7 +10,8 @@ use blaze_runtime::read_password;
 use mongodb::bson::{Document, doc};
 use mongodb::error::{Error, ErrorKind, WriteFailure};
 use mongodb::options::{
-    ClientOptions, DatabaseOptions, ReadPreference, SelectionCriteria, WriteConcern,
+    ClientOptions, ConnectionString, DatabaseOptions, ReadPreference, SelectionCriteria,
+    WriteConcern,
 };
 use mongodb::{Client, Collection};
 use tokio::sync::Mutex;
@@ -27,11 +28,18 @@ const OPERATION: Duration = Duration::from_secs(5);
 const LOG_IN_AGAIN: Duration = Duration::from_secs(1);
 /// Most connections: one who writes, one who reads.
 const CONNECTIONS: u32 = 4;
-/// Longest name of a database.
-const NAME_BYTES: usize = 63;
 const DUPLICATE_KEY: i32 = 11_000;
 /// No right, wrong password, no such command: waiting does not help.
 const NEVER: [i32; 3] = [13, 18, 59];
+
+/// What is wrong with the URI, as far as that is seen without the server.
+///
+/// # Errors
+/// For people; it names the part that is wrong and not the whole, for it may hold a password.
+pub fn check_uri(section: &MongoSection) -> Result<(), String> {
+    let parsed = ConnectionString::parse(section.uri.reveal());
+    parsed.map(drop).map_err(|error| error.kind.to_string())
+}
 
 /// Where the copy is.
 #[derive(Clone)]
@@ -102,27 +110,13 @@ pub(crate) struct Tables {
 
 impl Server {
     /// `place` is what errors call it.
-    ///
-    /// # Errors
-    /// [`CopyError::Refused`] for a name that no database can have.
-    pub(crate) fn new(section: MongoSection, copy: &str, place: &str) -> Result<Self, CopyError> {
-        let database = &section.database;
-        let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
-        if database.is_empty() || database.len() > NAME_BYTES || !database.chars().all(allowed) {
-            return Err(CopyError::Refused {
-                place: "MongoDB".to_owned(),
-                detail: format!(
-                    "{database:?} is no name of a database: 1 to {NAME_BYTES} of A-Z, a-z, 0-9, _ \
-                     and -"
-                ),
-            });
-        }
-        Ok(Self {
+    pub(crate) fn new(section: MongoSection, copy: &str, place: &str) -> Self {
+        Self {
             section,
             app_name: format!("blaze-worker/{copy}"),
             place: place.to_owned(),
             connected: Arc::default(),
-        })
+        }
     }
 
     /// The collections. Where the file holds another password, a client that logs in with it is

@@ -16,7 +16,6 @@ use mongodb::bson::{Bson, DateTime, Document, doc};
 use mongodb::options::ReturnDocument;
 
 use super::{Held, Lease, Mark};
-use crate::copy::CopyError;
 use crate::copy::mongo_client::{Server, is_duplicate};
 
 /// A document of MongoDB, which names the worker while it is held.
@@ -29,12 +28,10 @@ pub struct MongoLease {
 
 impl MongoLease {
     /// The lease of a layer, for a worker. It is connected to at the first use.
-    ///
-    /// # Errors
-    /// [`CopyError::Refused`] for a name that no database can have.
-    pub fn new(section: MongoSection, layer: LayerName, owner: String) -> Result<Self, CopyError> {
+    #[must_use]
+    pub fn new(section: MongoSection, layer: LayerName, owner: String) -> Self {
         let place = format!("MongoDB {}, lease {layer}", section.database);
-        Ok(Self { server: Server::new(section, "lease", &place)?, place, layer, owner })
+        Self { server: Server::new(section, "lease", &place), place, layer, owner }
     }
 }
 

@@ -64,7 +64,7 @@ fn mongodb(
     layer: &LayerName,
     owner: &str,
 ) -> anyhow::Result<Arc<dyn Lease>> {
-    let lease = super::MongoLease::new(section.clone(), layer.clone(), owner.to_owned())?;
+    let lease = super::MongoLease::new(section.clone(), layer.clone(), owner.to_owned());
     Ok(Arc::new(lease))
 }
 

@@ -10,7 +10,8 @@ use blaze_domain::node_file::{MongoSection, SecretText};
 use blaze_runtime::read_password;
 use mongodb::bson::{Document, doc};
 use mongodb::options::{
-    ClientOptions, DatabaseOptions, ReadConcern, ReadPreference, SelectionCriteria, WriteConcern,
+    ClientOptions, ConnectionString, DatabaseOptions, ReadConcern, ReadPreference,
+    SelectionCriteria, WriteConcern,
 };
 use mongodb::{Client, Collection, Database};
 
@@ -26,8 +27,6 @@ const SELECTION: Duration = Duration::from_millis(1_500);
 const CONNECT: Duration = Duration::from_secs(2);
 /// Between two looks at each server, where the URI says nothing else.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Longest name of a database.
-const NAME_BYTES: usize = 63;
 
 /// A read that many wait for.
 pub(super) const QUICK: Duration = Duration::from_secs(2);
@@ -35,6 +34,15 @@ pub(super) const QUICK: Duration = Duration::from_secs(2);
 pub(super) const USUAL: Duration = Duration::from_secs(10);
 /// Reading everything.
 pub(super) const LONG: Duration = Duration::from_secs(120);
+
+/// What is wrong with the URI, as far as that is seen without the server.
+///
+/// # Errors
+/// For people; it names the part that is wrong and not the whole, for it may hold a password.
+pub fn check_uri(section: &MongoSection) -> Result<(), String> {
+    let parsed = ConnectionString::parse(section.uri.reveal());
+    parsed.map(drop).map_err(|error| error.kind.to_string())
+}
 
 /// Where the store is, and its collections as they are reached now.
 pub(super) struct Connection {
@@ -123,7 +131,6 @@ impl Tables {
         password: Option<SecretText>,
     ) -> Result<Self, StoreError> {
         let name = &section.database;
-        check_name(name)?;
         let app_name = format!("blaze-config/{name}");
         let uri = section.uri_with(password.as_ref());
         let mut options = ClientOptions::parse(uri.reveal()).await.map_err(store_error)?;
@@ -194,16 +201,6 @@ fn database_options() -> DatabaseOptions {
         .build()
 }
 
-fn check_name(name: &str) -> Result<(), StoreError> {
-    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
-    if name.is_empty() || name.len() > NAME_BYTES || !name.chars().all(allowed) {
-        return Err(StoreError::Refused(format!(
-            "{name:?} is no name of a database: 1 to {NAME_BYTES} of A-Z, a-z, 0-9, _ and -"
-        )));
-    }
-    Ok(())
-}
-
 /// Waits for the driver, which has no limit of its own once a request is sent.
 ///
 /// # Errors
@@ -236,14 +233,6 @@ fn too_slow(limit: Duration) -> StoreError {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_of_databases_are_checked_before_anything_is_asked() {
-        check_name("blaze_main-2").unwrap();
-        for wrong in ["", "a/b", "a.b", "$cmd", "ä", "a b", &"x".repeat(64)] {
-            assert!(matches!(check_name(wrong), Err(StoreError::Refused(_))), "{wrong}");
-        }
-    }
 
     #[tokio::test]
     async fn a_uri_that_is_none_is_refused() {

@@ -50,6 +50,7 @@ use mongodb::{ClientSession, Cursor};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
+pub use self::client::check_uri;
 use self::client::{Connection, Tables, USUAL, limited_steps};
 use self::errors::store_error;
 use self::fence::Fence;

@@ -73,11 +73,17 @@ fn files_that_are_none_are_faults_of_the_configuration() {
                  layer: { kafka: { bootstrap: [\"127.0.0.1:9\"], properties: { acks: \"1\" } } }\n";
     let password = "layer: { name: fog, kind: fog }\nnode: { name: server-1 }\nbrokers: { node: { memory: {} } }\n\
                     database: { mongodb: { uri: \"mongodb://me@h\",\n  password_file: /nowhere/password } }\n";
+    let uri = "layer: { name: fog, kind: fog }\nnode: { name: server-1 }\nbrokers: { node: { memory: {} } }\n\
+               database: { mongodb: {\n  uri: \"mongodb://h/?nonsense=1\" } }\n";
+    let store = "control_plane: { auth: { issuer: i, jwks: { url: \"https://127.0.0.1:9/k\" } }, store: { mongodb: {\n  \
+                 password_file: /nowhere/password, uri: \"mongodb://me@h\" } } }\n";
     for (program, name, content, place) in [
         ("blaze-flow", "empty", "", ""),
         ("blaze-flow", "syntax", "a: [1\nb: }", ""),
         ("blaze-flow", "kafka", kafka, ":4: brokers.layer.kafka.properties.acks: "),
         ("blaze-worker", "password", password, ":5: database.mongodb.password_file: "),
+        ("blaze-worker", "uri", uri, ":5: database.mongodb.uri: "),
+        ("blaze-config", "store", store, ":2: control_plane.store.mongodb.password_file: "),
     ] {
         let path = written(folder.path(), name, content);
         let (code, _, faults) = output(program, &["--config", &path, "--check"], &[]);

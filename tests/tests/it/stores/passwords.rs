@@ -32,7 +32,7 @@ impl Users {
         let section = MongoSection { password_file: Some(file), ..MongoSection::of(&uri, "main") };
         let store = StoreSection::MongoDb(section.clone());
         let store = store::open(&store, supervisor).await.unwrap();
-        let lease = MongoLease::new(section, "edge".parse().unwrap(), "me".to_owned()).unwrap();
+        let lease = MongoLease::new(section, "edge".parse().unwrap(), "me".to_owned());
         Self { store, lease, revision: 0 }
     }
 

@@ -38,7 +38,7 @@ fn keys_on(server: &RedisServer) -> Arc<RedisKeys> {
 async fn run_on_mongo(uri: &str, database: &str) -> Result<(), String> {
     let lease = |layer: &str, owner: &str| -> Arc<dyn Lease> {
         let section = MongoSection::of(uri, database);
-        Arc::new(MongoLease::new(section, layer.parse().unwrap(), owner.to_owned()).unwrap())
+        Arc::new(MongoLease::new(section, layer.parse().unwrap(), owner.to_owned()))
     };
     run_all(&lease, BUSY).await
 }

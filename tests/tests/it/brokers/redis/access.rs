@@ -129,7 +129,7 @@ async fn bad_settings_are_told_at_once() {
             json!({ "url": "redis://h:1", "password_file": "/nowhere/password" }),
             "redis.password_file",
         ),
-        (json!({ "url": "redis://user:secret@h:99999" }), "redis.url"),
+        (json!({ "url": "redis://user:secret@h/first" }), "redis.url"),
         (json!({ "url": "redis+unix:///s", "tls": {} }), "redis.tls"),
         (
             json!({ "url": "rediss://h:1", "tls": { "ca_file": "/nowhere/ca" } }),
