@@ -223,6 +223,12 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
     }
 
     /// Everything that is held of a group.
+    pub fn items(&self, group: G) -> impl Iterator<Item = &T> {
+        let lines = self.groups.get(&group).into_iter().flat_map(|group| group.lines.values());
+        lines.flat_map(|line| line.places.values().map(|place| &place.item))
+    }
+
+    /// The same, to be changed.
     pub fn items_mut(&mut self, group: &G) -> impl Iterator<Item = &mut T> {
         let group = self.groups.get_mut(group);
         let lines = group.into_iter().flat_map(|group| group.lines.values_mut());

@@ -23,6 +23,7 @@ use std::time::Instant;
 
 use blaze_domain::node_file::{Compression, TopicRule, TopicValues};
 use blaze_domain::{DropReason, TopicName, WriterId};
+use blaze_proto::Frame;
 use bytes::Bytes;
 
 use super::admit::Admitted;
@@ -185,6 +186,12 @@ impl CompressStage {
             }
         }
         moved
+    }
+
+    /// What it holds for one bridge of a topic.
+    pub(super) fn frames_for(&self, topic: TopicId, bridge: usize) -> impl Iterator<Item = &Frame> {
+        let lanes = self.out.items(topic).flat_map(|out| &out.lanes);
+        lanes.filter(move |(at, _)| *at == bridge).map(|(_, waiting)| &waiting.frame)
     }
 
     fn waiting(&self, urgency: Urgency) -> usize {

@@ -1,6 +1,6 @@
 //! Topics and bridges come, go and are forgotten: which has which place in the message path.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::time::Instant;
 
 use blaze_domain::{TopicName, WriterId};
@@ -8,7 +8,7 @@ use blaze_domain::{TopicName, WriterId};
 use super::compress_stage::{Arrival, ToLanes};
 use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
-use super::succession::LONGEST_WAIT;
+use super::succession::{Held, LONGEST_WAIT};
 use super::writer::NewWriter;
 use crate::link::LaneId;
 use crate::plan::{Bridge, Target, TopicPlan};
@@ -141,11 +141,21 @@ impl DataCore {
             let Some(bridge) = path.bridges.get_mut(at) else {
                 continue;
             };
-            // What is kept is older than what another bridge has held for this one.
+            // What of a writer waits for this bridge already, held or with the codec, is on its
+            // way; what is kept besides is older, and goes before it.
             let passed_on = bridge.held.as_mut().map(std::mem::take);
-            let newer_waits = passed_on.is_some() || bridge.in_codec > 0;
+            let mut first_waiting: HashMap<WriterId, u64> = HashMap::new();
+            let held = passed_on.iter().flat_map(Held::frames);
+            for frame in held.chain(self.compress.frames_for(topic, at)) {
+                let first = first_waiting.entry(frame.writer()).or_insert(u64::MAX);
+                *first = frame.sequence().min(*first);
+            }
             let mut passed = Vec::new();
             for message in self.kept.of(now, topic, bridge.from) {
+                let first = first_waiting.get(&message.frame.writer());
+                if first.is_some_and(|first| *first <= message.frame.sequence()) {
+                    continue;
+                }
                 // The rules may have changed since it came.
                 if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(&message) {
                     let waiting = bridge.pass(now, &message, large, &mut path.gates);
@@ -155,8 +165,7 @@ impl DataCore {
                 }
             }
             for (frame, lanes) in passed {
-                // From the codec it would come back behind what is held or is there already.
-                if newer_waits {
+                if first_waiting.contains_key(&frame.writer()) {
                     self.put_to_lanes(now, topic, lanes, link);
                 } else {
                     self.compress_out(now, topic, &frame, lanes, Arrival::Kept, link);

@@ -6,6 +6,9 @@
 //!                 B: holds what comes, in order                                             └─► B sends it, and goes on
 //! ```
 //!
+//! What has not been given to the lane of A yet, because A held it or it is with the codec, goes to
+//! B.
+//!
 //! An acknowledgement says that A has a message, not that A's broker has it: where that stands
 //! still, messages wait with A, and those that B gets meanwhile would be written at the same time.
 //! So A is asked, and says yes when all that it had is with its brokers. It is not waited for when
@@ -87,6 +90,10 @@ impl Waiting {
 pub(super) struct Held(VecDeque<Waiting>);
 
 impl Held {
+    pub(super) fn frames(&self) -> impl Iterator<Item = &Frame> {
+        self.0.iter().map(|message| &message.frame)
+    }
+
     /// Adds what comes after it.
     pub(super) fn append(&mut self, later: Option<Self>) {
         self.0.extend(later.unwrap_or_default().0);
@@ -134,7 +141,8 @@ impl Succession {
     /// What the receiver of a bridge that drains has got is to be written before another one goes
     /// on.
     pub(super) fn await_written(&mut self, now: Instant, topic: TopicId, bridge: &mut BridgeState) {
-        // What is with the codec will be given to its lane, where no bridge here goes on.
+        // What is with the codec will be given to its lane; where a bridge here goes on it has that
+        // (`pass_on`), and this is taken back.
         let was_used = bridge.submitted || bridge.in_codec > 0;
         if self.leaving || !was_used || bridge.unwritten.is_some() {
             return;
