@@ -165,6 +165,7 @@ impl DataCore {
                 }
             }
             for (frame, lanes) in passed {
+                // From the codec it would come back behind what waits.
                 if first_waiting.contains_key(&frame.writer()) {
                     self.put_to_lanes(now, topic, lanes, link);
                 } else {

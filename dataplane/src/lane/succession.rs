@@ -90,6 +90,7 @@ impl Waiting {
 pub(super) struct Held(VecDeque<Waiting>);
 
 impl Held {
+    /// Oldest first.
     pub(super) fn frames(&self) -> impl Iterator<Item = &Frame> {
         self.0.iter().map(|message| &message.frame)
     }

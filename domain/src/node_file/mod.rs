@@ -304,15 +304,15 @@ fn url(schemes: &'static [&'static str]) -> impl Fn(&Node<'_>) -> Option<SecretT
         if rest.is_empty() || rest.contains(char::is_whitespace) {
             return node.fault(format!("is not a URL that starts with {}", schemes.join(" or ")));
         }
-        if !has_ports_that_are_some(rest) {
-            return node.fault("names a port that is none: 1 to 65535 are");
+        if !has_valid_ports(rest) {
+            return node.fault("has a port that is not between 1 and 65535");
         }
         Some(SecretText(text))
     }
 }
 
-/// Whether the ports of the hosts of a URL can be ones, as far as it has any.
-fn has_ports_that_are_some(rest: &str) -> bool {
+/// Whether each port that a URL names is between 1 and 65535. `rest`: what follows the scheme.
+fn has_valid_ports(rest: &str) -> bool {
     let place = rest.split(['/', '?', '#']).next().unwrap_or_default();
     let hosts = place.rsplit_once('@').map_or(place, |(_, hosts)| hosts);
     hosts.split(',').all(|host| match host.rsplit_once(':') {
