@@ -51,8 +51,12 @@ pub(crate) async fn run(parent: &Path, services: usize) -> anyhow::Result<Vec<Ro
     let folder = tempfile::tempdir_in(parent)?;
     let redis = block_in_place(|| RedisServer::start(RedisKind::Redis, RedisOptions::default()))?;
     let spec = WorkerSpec::on_memory(LAYER, &node(0), &fleet.main.server()).on_redis(&redis.url());
-    let worker = block_in_place(|| WorkerProcess::start(folder.path(), &spec))?;
     let notices = listen(&redis.url(), &format!("{}:blaze/config/changed/*", node(0)))?;
+    let worker = block_in_place(|| WorkerProcess::start(folder.path(), &spec))?;
+    // A worker that has just come tells each service what it has.
+    for _ in 0..services {
+        block_in_place(|| notices.recv_timeout(PATIENCE)).context("a first notice in time")?;
+    }
     let mut rows = Vec::new();
     for (change, touched) in
         [("nothing that counts", 0), ("one service", 1), ("all services", services)]
