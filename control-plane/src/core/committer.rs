@@ -29,7 +29,7 @@ use super::log::Log;
 use super::report::{AnswerKind, Done};
 use super::view::view;
 use crate::store::{
-    AuditEntry, Change, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError,
+    AuditEntry, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError,
 };
 use blaze_domain::config::state::State;
 
@@ -405,7 +405,7 @@ fn work_out(
             Ok(evaluated) => {
                 let before = state.clone();
                 if !evaluated.changes.is_empty() {
-                    state.advance(revision, evaluated.changes.iter().map(Change::step));
+                    state = evaluated.after.clone();
                 }
                 let done = Done {
                     revision: state.revision(),

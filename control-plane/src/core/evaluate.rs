@@ -152,6 +152,8 @@ pub(crate) struct Evaluated {
     pub(crate) changes: Vec<Change>,
     /// One per item in order, then what was pruned or deleted along with others.
     pub(crate) results: Vec<(Key, ApplyAction)>,
+    /// The state with the changes, at their revision.
+    pub(crate) after: State,
 }
 
 /// What evaluating needs besides the state.
@@ -278,7 +280,7 @@ impl Evaluator {
             let action = actions.get(&key).copied().unwrap_or(ApplyAction::Unchanged);
             (key, action)
         });
-        Ok(Evaluated { results: results.collect(), changes })
+        Ok(Evaluated { results: results.collect(), changes, after })
     }
 
     /// The document that is stored; `None` if nothing changes.

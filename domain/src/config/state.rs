@@ -229,7 +229,10 @@ impl State {
     /// Puts a document, in place of the one of the same key.
     pub fn put(&mut self, document: Arc<Document>) {
         let held = Arc::new(Held::new(document));
-        self.remove(&held.document.key);
+        // Replaced where it stands: to take it out first costs as much again.
+        if let Some(before) = self.documents.insert(held.document.key.clone(), Arc::clone(&held)) {
+            self.forget(&before);
+        }
         for (index, entry) in index_entries(&held.document) {
             self.index(index).insert(entry);
         }
@@ -241,12 +244,17 @@ impl State {
         }
         self.big += usize::from(held.is_big());
         self.schemas += usize::from(held.has_schema());
-        self.documents.insert(held.document.key.clone(), held);
     }
 
     /// Takes a document away.
     pub fn remove(&mut self, key: &Key) -> Option<Arc<Held>> {
         let held = self.documents.remove(key)?;
+        self.forget(&held);
+        Some(held)
+    }
+
+    /// Takes away what is known of a document besides itself.
+    fn forget(&mut self, held: &Held) {
         for (index, entry) in index_entries(&held.document) {
             self.index(index).remove(&entry);
         }
@@ -256,7 +264,6 @@ impl State {
         }
         self.big -= usize::from(held.is_big());
         self.schemas -= usize::from(held.has_schema());
-        Some(held)
     }
 
     fn index(&mut self, index: Index) -> &mut OrdSet<(DocumentName, Key)> {

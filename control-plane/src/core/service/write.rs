@@ -314,12 +314,10 @@ impl ConfigService {
             // They are held as long as it runs, also when whoever asked has gone.
             let _held = (room, running);
             let evaluated = evaluator.evaluate(&before, &request, revision + 1, now())?;
-            let mut after = before.clone();
-            after.advance(revision + 1, evaluated.changes.iter().map(Change::step));
             let done = Done {
                 revision,
                 before,
-                after,
+                after: evaluated.after.clone(),
                 evaluated,
                 view: view(&request.caller.claims),
                 places: MAX_CANDIDATES,
