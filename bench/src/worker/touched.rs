@@ -16,7 +16,7 @@ use super::fleet::{Fleet, LAYER, node};
 
 /// Changes of each kind: CPU times come in steps of 10 ms.
 const CHANGES: usize = 20;
-/// For all notices of a change.
+/// For a notice.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Between two changes.
 const PAUSE: Duration = Duration::from_millis(200);
@@ -57,6 +57,7 @@ pub(crate) async fn run(parent: &Path, services: usize) -> anyhow::Result<Vec<Ro
     for _ in 0..services {
         block_in_place(|| notices.recv_timeout(PATIENCE)).context("a first notice in time")?;
     }
+    tokio::time::sleep(PAUSE).await;
     let mut rows = Vec::new();
     for (change, touched) in
         [("nothing that counts", 0), ("one service", 1), ("all services", services)]

@@ -404,13 +404,10 @@ fn work_out(
             Err(problem) => tried.push(Tried::Refused(problem)),
             Ok(evaluated) => {
                 let before = state.clone();
-                if !evaluated.changes.is_empty() {
-                    state = evaluated.after.clone();
-                }
+                state = evaluated.after.clone();
                 let done = Done {
                     revision: state.revision(),
                     before,
-                    after: state.clone(),
                     evaluated,
                     view: view(&one.request.caller.claims),
                     // The first answer and the kept one are the same.

@@ -146,13 +146,13 @@ impl Request {
 }
 
 /// What a request comes to.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub(crate) struct Evaluated {
     /// None: nothing changes.
     pub(crate) changes: Vec<Change>,
     /// One per item in order, then what was pruned or deleted along with others.
     pub(crate) results: Vec<(Key, ApplyAction)>,
-    /// The state with the changes, at their revision.
+    /// The state with the changes.
     pub(crate) after: State,
 }
 
@@ -272,7 +272,9 @@ impl Evaluator {
         }
         faults.finish_invalid()?;
         let mut after = state.clone();
-        after.advance(revision, changes.iter().map(Change::step));
+        if !changes.is_empty() {
+            after.advance(revision, changes.iter().map(Change::step));
+        }
         check_rights(state, &after, request, &changes)?;
         self.begin_rollouts(&mut after, request, &mut changes, &index_of, &mut faults, deadline)?;
         self.check_result([state, &after], request, &changes, &index_of, &mut faults, deadline)?;

@@ -28,7 +28,6 @@ pub(crate) struct Done {
     /// Of the commit; the present one if nothing changed.
     pub(crate) revision: u64,
     pub(crate) before: State,
-    pub(crate) after: State,
     pub(crate) evaluated: Evaluated,
     /// Who asked, as far as the answer may tell.
     pub(crate) view: View,
@@ -49,7 +48,7 @@ impl Done {
     /// The first document after a write of one.
     pub(crate) fn written(&self) -> Option<Written> {
         let (key, action) = self.evaluated.results.first()?;
-        let held = self.after.get(key)?;
+        let held = self.evaluated.after.get(key)?;
         Some(Written {
             document: Arc::clone(&held.shown),
             created: *action == ApplyAction::Created,
@@ -59,7 +58,7 @@ impl Done {
     /// The answer of `apply` and `revert`.
     pub(crate) fn report(&self, dry_run: bool) -> ApplyReport {
         let results = self.evaluated.results.iter().map(|(key, action)| {
-            let (was, is) = (self.before.get(key), self.after.get(key));
+            let (was, is) = (self.before.get(key), self.evaluated.after.get(key));
             let shown = |held: Option<&Arc<blaze_domain::config::state::Held>>| {
                 held.map(|held| Arc::clone(&held.shown))
             };
@@ -88,7 +87,8 @@ impl Done {
         let results = results.collect();
         let keys: Vec<Key> =
             self.evaluated.changes.iter().map(|change| change.document.key.clone()).collect();
-        let affected = affected::changed(&self.before, &self.after, &keys, &self.view, self.places);
+        let affected =
+            affected::changed(&self.before, &self.evaluated.after, &keys, &self.view, self.places);
         ApplyReport {
             dry_run,
             revision: if dry_run { self.before.revision() } else { self.revision },

@@ -447,3 +447,52 @@ fn moved_with(before: &State, after: &State, changed: &[Key]) -> Vec<Key> {
     out.dedup();
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn documents(specs: [Value; 4], phase: &str) -> Vec<Document> {
+        let keys = ["Node/n", "Instance/s/i", "Service/s", "Rollout/r"];
+        let new = |(key, spec): (&str, Value)| Document::new(key.parse().unwrap(), spec);
+        let mut all: Vec<Document> = keys.into_iter().zip(specs).map(new).collect();
+        all[3].status = Some(json!({ "phase": phase }));
+        all
+    }
+
+    #[test]
+    fn what_is_put_again_leaves_nothing_of_before() {
+        let target = json!({ "target": { "kind": "Service", "name": "s" } });
+        let large = json!({ "config": { "text": "x".repeat(2 * BIG_BYTES) }, "schema": {} });
+        let states = [
+            documents(
+                [json!({ "layer": "a" }), json!({ "layer": "a" }), json!({}), target],
+                "canary",
+            ),
+            documents(
+                [
+                    json!({ "layer": "a", "config": {} }),
+                    json!({ "node": "n" }),
+                    large,
+                    json!({ "target": { "kind": "Service", "name": "t" } }),
+                ],
+                "aborted",
+            ),
+        ];
+        let shown = |state: &State| {
+            format!(
+                "{:?} {:?} {:?} {:?} {} {}",
+                state.in_layer, state.on_node, state.aimed, state.active, state.big, state.schemas
+            )
+        };
+        let mut state = State::new(1, states[0].clone());
+        for documents in [&states[1], &states[0], &states[0], &states[1]] {
+            state.advance(2, documents.iter().cloned().map(Arc::new).map(Step::Put));
+            assert_eq!(shown(&state), shown(&State::new(2, documents.clone())));
+        }
+        state.advance(3, states[1].iter().map(|document| Step::Remove(document.key.clone())));
+        assert_eq!(shown(&state), shown(&State::new(3, [])));
+    }
+}

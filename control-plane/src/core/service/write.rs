@@ -317,7 +317,6 @@ impl ConfigService {
             let done = Done {
                 revision,
                 before,
-                after: evaluated.after.clone(),
                 evaluated,
                 view: view(&request.caller.claims),
                 places: MAX_CANDIDATES,
