@@ -1,27 +1,30 @@
 //! A packet filter in the kernel (classic BPF) that keeps datagrams from RustDDS 0.15 which make it
-//! allocate without bound, stand still or panic, and which it never sends itself:
+//! allocate without bound, stand still or panic, and which no implementation sends:
 //!
 //! | submessage | dropped when |
 //! |---|---|
-//! | DATA_FRAG | the sample is larger than any that flows send, the fragment size is not RustDDS' own, the fragment number or count is 0 |
-//! | HEARTBEAT, GAP | a sequence number is not within 0 to 2³¹ − 1, or the range is wider than any that RustDDS sends |
-//! | ACKNACK, NACK_FRAG, HEARTBEAT_FRAG | a sequence number is negative or above 2³² − 1, the bitmap or fragment number is beyond all that RustDDS sends for the samples of its topics |
+//! | DATA_FRAG | the sample is larger than any that is expected, the fragment size is not RustDDS' own (of other implementations: below 256 bytes), the fragment number or count is 0 |
+//! | HEARTBEAT, GAP | the range is wider than any that writers send, ends more than one before its begin, or crosses a multiple of 2³² |
+//! | ACKNACK, NACK_FRAG, HEARTBEAT_FRAG | the bitmap or fragment number is beyond all that is sent for the samples of the topics |
+//! | all of these | a sequence number is negative, or 2⁴⁷ or more |
 //!
 //! Everything else passes; what RustDDS' parser refuses is left to it. The walk over the
 //! submessages is unrolled, since a filter has no loops, so datagrams with more submessages than
 //! there are steps are dropped, too. A *full* step knows all kinds. A *quick* step takes DATA and
-//! INFO_TS as RustDDS writes them, of which it packs many into one datagram; at anything else it
-//! leaves to the next full step.
+//! INFO_TS in little endian, of which many are packed into one datagram; at anything else it leaves
+//! to the packed steps. A *packed* step takes what other implementations than RustDDS pack, too:
+//! INFO_DST, HEARTBEAT, ACKNACK and GAP; at anything else it leaves to the last full steps.
 
 mod assembler;
 mod program;
 mod socket;
+mod steps;
 #[cfg(test)]
 mod tests;
 
 use std::io;
 
-pub(super) use program::{Samples, Shape};
+pub(super) use program::Samples;
 pub(super) use socket::{Attached, attach};
 
 /// Why datagrams are not filtered.

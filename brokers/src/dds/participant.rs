@@ -14,7 +14,7 @@ use rustdds::{
     QosPolicyBuilder, RTPSEntity, Subscriber, Topic, TopicKind, no_key,
 };
 
-use super::filter::{self, Attached, FilterError, Samples, Shape};
+use super::filter::{self, Attached, FilterError, Samples};
 use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
@@ -59,6 +59,9 @@ pub struct ParticipantConfig {
     /// Whether single fragments of such samples are asked for again, as readers of reliable writers
     /// do.
     pub repairs_fragments: bool,
+    /// Whether other implementations of DDS take part: their fragments have other sizes, and they
+    /// pack other submessages into one datagram.
+    pub any_vendor: bool,
 }
 
 impl ParticipantConfig {
@@ -72,11 +75,16 @@ impl ParticipantConfig {
             send_buffer_bytes: 64 * 1024,
             largest_sample: 64 * 1024,
             repairs_fragments: false,
+            any_vendor: false,
         }
     }
 
     fn samples(&self) -> Samples {
-        Samples { largest: self.largest_sample, repaired: self.repairs_fragments }
+        Samples {
+            largest: self.largest_sample,
+            repaired: self.repairs_fragments,
+            any_vendor: self.any_vendor,
+        }
     }
 
     fn check(&self) -> Result<(), DdsError> {
@@ -340,7 +348,7 @@ impl Participant {
 
 fn weakness(filter: &Result<Attached, FilterError>) -> Option<String> {
     match filter {
-        Ok(attached) if attached.shape == Shape::LARGE => None,
+        Ok(attached) if !attached.is_small => None,
         Ok(_) => Some(
             "the packet filter is a small one, since net.core.optmem_max is below 61440".into(),
         ),

@@ -50,8 +50,6 @@ pub(super) enum Op {
     ShiftRight = 0x74,
     /// X = A
     ToIndex = 0x07,
-    /// A = X
-    FromIndex = 0x87,
     /// Ends; k bytes of the packet are kept, 0 drops it.
     Return = 0x06,
 }
@@ -66,6 +64,8 @@ pub(super) enum Test {
     AnyBit = 0x45,
     /// A == X
     EqualsIndex = 0x1d,
+    /// A > k (unsigned)
+    Above = 0x25,
     /// A > X (unsigned)
     AboveIndex = 0x2d,
 }

@@ -24,8 +24,8 @@ const OWN_FILES: &str = "/proc/self/fd";
 #[derive(Debug)]
 pub(in super::super) struct Attached {
     inodes: HashSet<u64>,
-    /// What fitted.
-    pub(in super::super) shape: Shape,
+    /// The large shape did not fit.
+    pub(in super::super) is_small: bool,
 }
 
 impl Attached {
@@ -91,7 +91,7 @@ pub(in super::super) fn attach(ports: &[u16], samples: Samples) -> Result<Attach
     let own = own_sockets().map_err(system("the own sockets are not known"))?;
     let all = udp_sockets().map_err(system("the UDP sockets are not known"))?;
     let this = pidfd_open(getpid(), PidfdFlags::empty()).map_err(errno("pidfd_open"))?;
-    let mut attached = Attached { inodes: HashSet::new(), shape: Shape::LARGE };
+    let mut attached = Attached { inodes: HashSet::new(), is_small: false };
     for found in all.iter().filter(|socket| ports.contains(&socket.port)) {
         let Some(descriptor) = own.get(&found.inode) else {
             continue;
@@ -99,7 +99,7 @@ pub(in super::super) fn attach(ports: &[u16], samples: Samples) -> Result<Attach
         let duplicate = pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty())
             .map_err(errno("pidfd_getfd"))?;
         if let Some(socket) = still_bound(duplicate, found.port) {
-            attach_one(&socket, samples, &mut attached.shape)?;
+            attach_one(&socket, samples, &mut attached.is_small)?;
             attached.inodes.insert(found.inode);
         }
     }
@@ -117,17 +117,16 @@ fn still_bound(duplicate: OwnedFd, port: u16) -> Option<Socket> {
 }
 
 /// Attaches the largest filter for which the system has room.
-fn attach_one(socket: &Socket, samples: Samples, shape: &mut Shape) -> Result<(), FilterError> {
-    if *shape == Shape::LARGE {
-        match socket.attach_filter(&filters(Shape::LARGE, samples)?) {
+fn attach_one(socket: &Socket, samples: Samples, is_small: &mut bool) -> Result<(), FilterError> {
+    let [large, small] = Shape::both(samples);
+    if !*is_small {
+        match socket.attach_filter(&filters(large, samples)?) {
             Ok(()) => return Ok(()),
-            Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => {
-                *shape = Shape::SMALL;
-            }
+            Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => *is_small = true,
             Err(error) => return Err(system("the filter was refused")(error)),
         }
     }
-    socket.attach_filter(&filters(*shape, samples)?).map_err(system("the filter was refused"))
+    socket.attach_filter(&filters(small, samples)?).map_err(system("the filter was refused"))
 }
 
 fn filters(shape: Shape, samples: Samples) -> Result<Vec<SockFilter>, FilterError> {

@@ -21,7 +21,7 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
         let code = it.code;
         let slot = it.k as usize % 16;
         let is = |op: Op| op as u16 == code;
-        let test = [Test::Equal, Test::AnyBit, Test::EqualsIndex, Test::AboveIndex]
+        let test = [Test::Equal, Test::AnyBit, Test::EqualsIndex, Test::Above, Test::AboveIndex]
             .into_iter()
             .find(|test| *test as u16 == code);
         if let Some(test) = test {
@@ -29,6 +29,7 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
                 Test::Equal => a == it.k,
                 Test::AnyBit => a & it.k != 0,
                 Test::EqualsIndex => a == x,
+                Test::Above => a > it.k,
                 Test::AboveIndex => a > x,
             };
             at += usize::from(if holds { it.if_true } else { it.if_false });
@@ -60,7 +61,6 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
                 () if is(Op::And) => a &= it.k,
                 () if is(Op::ShiftRight) => a >>= it.k,
                 () if is(Op::ToIndex) => x = a,
-                () if is(Op::FromIndex) => a = x,
                 () => panic!("unknown instruction {it:?}"),
             }
         }
@@ -68,19 +68,27 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
 }
 
 const LARGEST: u32 = 60 * 1024 + 8;
-const SAMPLES: Samples = Samples { largest: LARGEST, repaired: false };
+const SAMPLES: Samples = Samples { largest: LARGEST, repaired: false, any_vendor: false };
+const ANY_VENDOR: Samples = Samples { any_vendor: true, ..SAMPLES };
 
-fn passes_shape(shape: Shape, datagram: &[u8]) -> bool {
+fn passes_shape(shape: Shape, samples: Samples, datagram: &[u8]) -> bool {
     let mut packet = vec![0; 8];
     packet.extend_from_slice(datagram);
-    interpret(&program(shape, SAMPLES).unwrap(), &packet) != 0
+    interpret(&program(shape, samples).unwrap(), &packet) != 0
 }
 
 /// Whether a datagram passes; both shapes must agree.
-fn passes(datagram: &[u8]) -> bool {
-    let large = passes_shape(Shape::LARGE, datagram);
-    assert_eq!(passes_shape(Shape::SMALL, datagram), large, "{datagram:02x?}");
+fn passes_of(samples: Samples, datagram: &[u8]) -> bool {
+    let [large, small] = Shape::both(samples).map(|it| passes_shape(it, samples, datagram));
+    assert_eq!(large, small, "{datagram:02x?}");
     large
+}
+
+/// Whether it passes, whoever may send; all filters must agree.
+fn passes(datagram: &[u8]) -> bool {
+    let passes = passes_of(SAMPLES, datagram);
+    assert_eq!(passes_of(ANY_VENDOR, datagram), passes, "{datagram:02x?}");
+    passes
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -200,10 +208,13 @@ fn what_rustdds_sends_passes() {
             vec![e.info_ts(), e.data(400), e.heartbeat(1, 1)],
             vec![e.heartbeat(1, 0)],
             vec![e.heartbeat(1, (1 << 20) - 1)],
-            vec![e.heartbeat(0x7ff0_0001, 0x7fff_ffff)],
+            vec![e.heartbeat(0x1_0000, 0xffff)],
+            vec![e.heartbeat(0x7ff0_0001, 0x7fff_ffff), e.heartbeat(0xfff0_0001, 0xffff_ffff)],
+            vec![e.heartbeat((1 << 40) + 1, (1 << 40) + 7), e.acknack((1 << 40) + 8, 0)],
+            vec![e.gap(1, 0xffff_fff0)],
             vec![e.info_dst(), e.acknack(1, 256), e.nack_frag(2, 1, 256)],
             vec![e.info_dst(), e.gap(0x1_0000, 0x1_ffff), e.heartbeat(0x1_ffff, 0x2_0001)],
-            vec![e.gap(1, 0x7fff_fff0)],
+            vec![e.gap(1, 1 << 46)],
             vec![e.heartbeat_frag(1, 240)],
             vec![e.submessage(0x80, &[1, 2, 3]), e.submessage(0x0f, &[0; 4])],
             vec![],
@@ -230,15 +241,20 @@ fn what_exhausts_rustdds_is_dropped_wherever_it_stands() {
             e.heartbeat(1, 0x8000_0000),
             e.heartbeat(0x8000_0000, 1),
             e.heartbeat(-5, 1),
+            e.heartbeat(-5, -1),
             e.heartbeat(1, i64::MAX),
-            e.heartbeat(1 << 32, (1 << 32) + 1),
+            e.heartbeat(1 << 47, (1 << 47) + 1),
+            e.heartbeat(1, (1 << 32) + 1),
             e.gap(2, 0x7fff_ffff),
-            e.gap(2, 0x2_0000),
+            e.gap(2, 1 << 21),
             e.gap(i64::MIN, 1),
-            e.gap(1, 1 << 40),
+            e.gap(1, 1 << 47),
+            e.gap(1, -1),
+            e.gap((1 << 32) + 2, (1 << 32) + (1 << 21)),
             e.gap(0x0100_0000, 0x7000_0000),
             e.acknack(1, u32::MAX),
             e.acknack(-1, 1),
+            e.acknack(1 << 47, 1),
             e.nack_frag(1, 0, 1),
             e.nack_frag(1, u32::MAX, 1),
             e.nack_frag(1, 1024, 1),
@@ -264,14 +280,13 @@ fn what_exhausts_rustdds_is_dropped_wherever_it_stands() {
                 for run in 0..24 {
                     let mut many = vec![other.data(8); run];
                     many.push(bad.clone());
-                    assert!(
-                        !passes_shape(Shape::LARGE, &message(&many)),
-                        "behind {run}: {bad:02x?}"
-                    );
-                    assert!(
-                        !passes_shape(Shape::SMALL, &message(&many)),
-                        "behind {run}: {bad:02x?}"
-                    );
+                    let many = message(&many);
+                    for samples in [SAMPLES, ANY_VENDOR] {
+                        for shape in Shape::both(samples) {
+                            let passes = passes_shape(shape, samples, &many);
+                            assert!(!passes, "behind {run}: {bad:02x?}");
+                        }
+                    }
                 }
             }
         }
@@ -305,14 +320,16 @@ fn long_runs_of_data_pass_up_to_the_number_of_steps() {
         submessages.push(Endian::Little.heartbeat(1, 100));
         message(&submessages)
     };
-    let steps = |shape: Shape| 2 * shape.full + shape.quick;
-    for shape in [Shape::LARGE, Shape::SMALL] {
-        // The heartbeat is the last step.
-        assert!(passes_shape(shape, &run(steps(shape) - 1)));
-        assert!(!passes_shape(shape, &run(steps(shape))));
-        let mut hidden = vec![Endian::Little.data(40); steps(shape) - 1];
-        hidden.push(Endian::Little.heartbeat(1, 0x7fff_ffff));
-        assert!(!passes_shape(shape, &message(&hidden)));
+    let steps = |shape: Shape| 2 * shape.full + shape.quick + shape.packed;
+    for samples in [SAMPLES, ANY_VENDOR] {
+        for shape in Shape::both(samples) {
+            // The heartbeat is the last step.
+            assert!(passes_shape(shape, samples, &run(steps(shape) - 1)));
+            assert!(!passes_shape(shape, samples, &run(steps(shape))));
+            let mut hidden = vec![Endian::Little.data(40); steps(shape) - 1];
+            hidden.push(Endian::Little.heartbeat(1, 0x7fff_ffff));
+            assert!(!passes_shape(shape, samples, &message(&hidden)));
+        }
     }
     // What a packet of 1500 bytes takes, with a time for each.
     let packet = vec![[Endian::Little.info_ts(), Endian::Little.data(64)].concat(); 11];
@@ -340,18 +357,17 @@ fn random_messages_agree_with_a_plain_walk() {
             let e = BOTH[random(2) as usize];
             let mut number = || edges[random(edges.len() as u64) as usize];
             let (first, second) = (number(), number());
-            let fine = |number: i64| number < 1 << 31;
             let width = (second >> 16) - (first >> 16);
             match random(5) {
                 0 => submessages.push(e.data(random(90) as usize)),
                 1 => submessages.push(e.info_ts()),
                 2 => {
                     submessages.push(e.heartbeat(first, second));
-                    good &= fine(first) && fine(second) && width <= 15;
+                    good &= (-1..=15).contains(&width);
                 }
                 3 => {
                     submessages.push(e.gap(first, second));
-                    good &= fine(first) && fine(second) && (width <= 1 || first == 1);
+                    good &= (-1..=1).contains(&width) || first == 1;
                 }
                 _ => {
                     submessages.push(e.data_frag(1, 1, 256, u32::try_from(first).unwrap()));
@@ -360,7 +376,7 @@ fn random_messages_agree_with_a_plain_walk() {
             }
         }
         let datagram = message(&submessages);
-        assert_eq!(passes(&datagram), good, "{datagram:02x?}");
+        assert_eq!(passes_of(SAMPLES, &datagram), good, "{datagram:02x?}");
         *(if good { &mut passed } else { &mut dropped }) += 1;
     }
     assert!(passed > 1000 && dropped > 1000, "{passed} passed, {dropped} dropped");
@@ -376,53 +392,81 @@ fn the_kernels_list_is_read() {
     assert_eq!(UdpSocketLine::parse(""), None);
 }
 
-/// The same datagrams as above through a socket that has the filter.
+/// The same datagrams as above through sockets that have a filter.
 #[test]
-fn the_kernel_takes_the_filter_and_drops_what_it_must() {
-    let receiver = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-    receiver.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
-    let port = receiver.local_addr().unwrap().port();
-    let attached = attach(&[port], SAMPLES).unwrap();
-    let sender = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-    let mut buffer = vec![0; 65_536];
-    for e in BOTH {
-        let before = attached.dropped();
-        let bad = [
-            e.heartbeat(1, 0x7fff_ffff),
-            e.gap(2, 1 << 30),
-            e.data_frag(1, 1, 256, 1 << 24),
-            e.nack_frag(1, u32::MAX, 1),
-        ];
-        for bad in &bad {
-            sender.send_to(&message(&[bad]), (Ipv4Addr::LOCALHOST, port)).unwrap();
-        }
-        let run = vec![e.data(40); attached.shape.quick];
-        let last = [e.info_ts(), e.data_frag(1, 1, 256, LARGEST), e.heartbeat(1, 9)];
-        for good in [vec![e.data(60_000)], last.to_vec(), run] {
-            let good = message(&good);
-            // Big-endian DATA takes full steps, which are few.
-            if good.len() < 6000 || e == Endian::Little || good.len() > 60_000 {
-                sender.send_to(&good, (Ipv4Addr::LOCALHOST, port)).unwrap();
-                let length = receiver.recv(&mut buffer).unwrap();
-                assert_eq!(buffer[..length], good);
+fn the_kernel_takes_the_filters_and_drops_what_it_must() {
+    for samples in [SAMPLES, ANY_VENDOR] {
+        let receiver = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        receiver.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+        let port = receiver.local_addr().unwrap().port();
+        let attached = attach(&[port], samples).unwrap();
+        let quick = Shape::both(samples)[usize::from(attached.is_small)].quick;
+        let sender = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        let send = |datagram: &[u8]| sender.send_to(datagram, (Ipv4Addr::LOCALHOST, port)).unwrap();
+        let mut buffer = vec![0; 65_536];
+        let mut received = |datagram: Vec<u8>| {
+            send(&datagram);
+            let length = receiver.recv(&mut buffer).unwrap();
+            assert_eq!(buffer[..length], datagram);
+        };
+        for e in BOTH {
+            let before = attached.dropped();
+            let bad = [
+                e.heartbeat(1, 0x7fff_ffff),
+                e.gap(2, 1 << 30),
+                e.data_frag(1, 1, 256, 1 << 24),
+                e.nack_frag(1, u32::MAX, 1),
+            ];
+            for bad in &bad {
+                send(&message(&[bad]));
             }
+            received(message(&[e.data(60_000)]));
+            let last = [e.info_ts(), e.data_frag(1, 1, 256, LARGEST), e.heartbeat(1, 9)];
+            received(message(&last));
+            assert_eq!(attached.dropped() - before, bad.len() as u64);
         }
-        assert_eq!(attached.dropped() - before, bad.len() as u64);
+        received(message(&vec![Endian::Little.data(40); quick]));
     }
     assert!(attach(&[1], SAMPLES).is_err(), "no socket of this process has port 1");
 }
 
 #[test]
 fn fragments_of_large_samples_are_asked_for_where_they_are_repaired() {
-    let samples = |repaired| Samples { largest: 16 << 20, repaired };
+    let samples = |repaired| Samples { largest: 16 << 20, repaired, any_vendor: false };
     for e in BOTH {
         for (fragment, passes) in [(1, true), (1023, true), (1024, false), (65_535, false)] {
-            let packet = [vec![0; 8], message(&[e.nack_frag(1, fragment, 1)])].concat();
-            let run = |samples| interpret(&program(Shape::LARGE, samples).unwrap(), &packet) != 0;
-            assert_eq!(run(samples(false)), passes, "{fragment}");
-            assert!(run(samples(true)), "{fragment}");
+            let packet = message(&[e.nack_frag(1, fragment, 1)]);
+            assert_eq!(passes_of(samples(false), &packet), passes, "{fragment}");
+            assert!(passes_of(samples(true), &packet), "{fragment}");
         }
-        let beyond = [vec![0; 8], message(&[e.nack_frag(1, 1 << 17, 1)])].concat();
-        assert_eq!(interpret(&program(Shape::LARGE, samples(true)).unwrap(), &beyond), 0);
+        assert!(!passes_of(samples(true), &message(&[e.nack_frag(1, 1 << 17, 1)])));
+    }
+}
+
+/// Fast DDS 2.14 and Cyclone 11 were seen to send these.
+#[test]
+fn what_other_implementations_send_passes_only_where_they_are_expected() {
+    let e = Endian::Little;
+    let announced = [vec![e.info_dst()], vec![[e.info_ts(), e.data(210)].concat(); 60]].concat();
+    let heartbeats = [vec![e.info_dst()], vec![e.heartbeat(1, 1); 30]].concat();
+    let repaired = [vec![e.info_dst()], vec![[e.data(40), e.gap(9, 70_000)].concat(); 14]];
+    let foreign = [
+        vec![e.info_ts(), e.data_frag(1, 1, 1344, LARGEST)],
+        vec![e.info_dst(), e.info_ts(), e.data_frag(1, 1, 65_324, 65_400), e.heartbeat(1, 7)],
+        [announced, vec![e.heartbeat(1, 60)]].concat(),
+        heartbeats,
+        repaired.concat(),
+        vec![e.info_dst(), e.gap(7, 0xf_ffff), e.heartbeat(1 << 20, 1 << 20)],
+        vec![e.info_ts(), e.data(40), e.submessage(0x80, &[1; 4]), e.heartbeat(1, 1)],
+    ];
+    for (number, submessages) in foreign.iter().enumerate() {
+        let datagram = message(submessages);
+        let large = |samples| passes_shape(Shape::both(samples)[0], samples, &datagram);
+        assert!(large(ANY_VENDOR), "{number}");
+        assert_eq!(large(SAMPLES), [2, 6].contains(&number), "{number}");
+    }
+    for e in BOTH {
+        assert!(passes_of(ANY_VENDOR, &message(&[e.data_frag(1, 1, 300, 1024)])));
+        assert!(!passes_of(ANY_VENDOR, &message(&[e.data_frag(1, 1, 255, 1024)])));
     }
 }
