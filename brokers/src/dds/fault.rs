@@ -6,8 +6,6 @@ use std::task::{Wake, Waker};
 use std::thread;
 use std::time::Duration;
 
-use bytes::Bytes;
-
 use super::farewell::Farewell;
 use super::{DdsError, GuidPrefix, Participant, Profile, create_error};
 
@@ -43,11 +41,11 @@ pub(super) fn inject(participant: &Participant, fault: Fault) -> Result<(), DdsE
     }
     let topic = format!("blaze/fault/{}", participant.prefix());
     let profile = Profile::best_effort(1);
-    let reader = participant.raw_reader(&topic, profile)?;
+    let reader = participant.raw_reader((&topic, super::FRAME_TYPE), profile)?;
     reader.set_waker(Some(Waker::from(Arc::new(Trap(fault)))));
     let writer = participant.writer(&topic, profile)?;
     for _ in 0..200 {
-        if writer.write(Bytes::from_static(b"!")) {
+        if writer.write(b"!") {
             break;
         }
         thread::sleep(Duration::from_millis(10));

@@ -13,7 +13,8 @@
 //! there are steps are dropped, too. A *full* step knows all kinds. A *quick* step takes DATA and
 //! INFO_TS in little endian, of which many are packed into one datagram; at anything else it leaves
 //! to the packed steps. A *packed* step takes what other implementations than RustDDS pack, too:
-//! INFO_DST, HEARTBEAT, ACKNACK and GAP; at anything else it leaves to the last full steps.
+//! INFO_DST, HEARTBEAT, ACKNACK, NACK_FRAG and GAP; at anything else it leaves to the last full
+//! steps.
 
 mod assembler;
 mod program;

@@ -37,9 +37,10 @@ use blaze_domain::node_file::MAX_DDS_DOMAIN;
 pub use fault::Fault;
 pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile};
 pub use pulse::{Illness, Pulse};
-pub use reader::{Reader, SampleSink};
+pub use reader::{OctetsSink, Reader, Sample, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
-pub use watch::{EndpointWatch, Endpoints, FoundReader, FoundWriter};
+pub use sample::{Cdr, octet_sequence};
+pub use watch::{EndpointWatch, Endpoints, FoundEndpoint};
 pub use writer::{EndpointId, Writer, Written};
 
 /// The type of all samples, IDL `sequence<octet>`.

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, sync_channel};
 use std::{thread, time};
 
-use rustdds::policy::{Durability, History, ResourceLimits};
+use rustdds::policy::{Deadline, Durability, History, Lifespan, Liveliness, ResourceLimits};
 use rustdds::{
     DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies,
     QosPolicyBuilder, RTPSEntity, Subscriber, Topic, TopicKind, no_key,
@@ -16,8 +16,8 @@ use rustdds::{
 
 use super::filter::{self, Attached, FilterError, Samples};
 use super::pulse::port_is_free;
-use super::reader::{Reader, SampleSink};
-use super::sample::{Octets, OctetsAdapter};
+use super::reader::{OctetsSink, Reader, SampleSink, of_octets};
+use super::sample::{Cdr, CdrAdapter};
 use super::watch::{EndpointWatch, Endpoints};
 use super::writer::{Writer, endpoint_of, participant_of};
 use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, create_error, multicast_port};
@@ -98,6 +98,22 @@ impl ParticipantConfig {
     }
 }
 
+/// Seconds of the Lifespan that marks the endpoints of flows: 67.7 years. Readers announce one, too,
+/// and nobody else asks for this one.
+const MARK_SECONDS: i32 = 0x7F4C_5A00;
+
+/// The mark is a nanosecond longer. On the wire that are 4.3 units of 1/2³² s: five, since four are
+/// read as no nanosecond.
+fn mark() -> Duration {
+    Duration::from_secs(MARK_SECONDS) + Duration::from_secs(5) / (1 << 32)
+}
+
+/// Whether a Lifespan is the mark. It may have been rounded.
+pub(super) fn is_mark(lifespan: Duration) -> bool {
+    let difference = lifespan.to_nanoseconds() - mark().to_nanoseconds();
+    (-1..=1).contains(&difference)
+}
+
 /// Quality of service of a writer or reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Profile {
@@ -112,13 +128,27 @@ pub struct Profile {
     /// not by others; at least `depth`. RustDDS keeps them, and those of the last six seconds, in
     /// memory.
     pub window: u16,
+    /// A writer offers a sample at least this often; a reader asks for that.
+    pub deadline: Option<time::Duration>,
+    /// A writer tells this often that it lives, by itself; a reader asks for that.
+    pub lease: Option<time::Duration>,
+    /// Whether it is marked as an endpoint of a flow, for other flows.
+    pub marked: bool,
 }
 
 impl Profile {
     /// Best effort with room for `depth` samples.
     #[must_use]
     pub fn best_effort(depth: u16) -> Self {
-        Self { reliable: false, depth, transient_local: false, window: 0 }
+        Self {
+            reliable: false,
+            depth,
+            transient_local: false,
+            window: 0,
+            deadline: None,
+            lease: None,
+            marked: false,
+        }
     }
 
     fn qos(self) -> QosPolicies {
@@ -126,7 +156,7 @@ impl Profile {
         let samples = depth.max(i32::from(self.window));
         let durability =
             if self.transient_local { Durability::TransientLocal } else { Durability::Volatile };
-        let builder = QosPolicyBuilder::new()
+        let mut builder = QosPolicyBuilder::new()
             .durability(durability)
             .history(History::KeepLast { depth })
             .resource_limits(ResourceLimits {
@@ -134,6 +164,16 @@ impl Profile {
                 max_instances: 1,
                 max_samples_per_instance: samples,
             });
+        if let Some(deadline) = self.deadline {
+            builder = builder.deadline(Deadline(Duration::from_std(deadline)));
+        }
+        if let Some(lease) = self.lease {
+            let lease_duration = Duration::from_std(lease);
+            builder = builder.liveliness(Liveliness::Automatic { lease_duration });
+        }
+        if self.marked {
+            builder = builder.lifespan(Lifespan { duration: mark() });
+        }
         if self.reliable {
             builder.reliable(Duration::ZERO).build()
         } else {
@@ -141,6 +181,9 @@ impl Profile {
         }
     }
 }
+
+/// A reader that nobody empties yet.
+pub(super) type RawReader = no_key::SimpleDataReader<Cdr, CdrAdapter>;
 
 /// One participant. Dropping it says good-bye to the others and ends its threads, which may take a
 /// while when one of them hangs: drop it where that does not matter.
@@ -233,25 +276,47 @@ impl Participant {
         self.filter.as_ref().map_or(0, Attached::dropped)
     }
 
-    /// Makes a writer of a topic.
+    /// Makes a writer of a topic of [`FRAME_TYPE`].
     ///
     /// # Errors
     /// [`DdsError`] when RustDDS refuses or has died.
     pub fn writer(&self, topic: &str, profile: Profile) -> Result<Writer, DdsError> {
+        self.typed_writer((topic, FRAME_TYPE), profile)
+    }
+
+    /// Makes a writer of a topic, given with its type.
+    ///
+    /// # Errors
+    /// [`DdsError`] when RustDDS refuses or has died.
+    pub fn typed_writer(&self, topic: (&str, &str), profile: Profile) -> Result<Writer, DdsError> {
         let publisher = self.publisher.clone();
         let writer = self.make("writer", topic, profile, move |topic| {
-            publisher.create_datawriter_no_key::<Octets, OctetsAdapter>(topic, Some(profile.qos()))
+            publisher.create_datawriter_no_key::<Cdr, CdrAdapter>(topic, Some(profile.qos()))
         })?;
         Ok(Writer::new(writer, profile.transient_local, Arc::clone(&self.failed)))
     }
 
-    /// Makes a reader of a topic, and the thread that hands its samples to `sink`.
+    /// Makes a reader of a topic of [`FRAME_TYPE`], and the thread that hands its samples to `sink`.
     ///
     /// # Errors
     /// [`DdsError`] when RustDDS refuses or has died.
     pub fn reader(
         &self,
         topic: &str,
+        profile: Profile,
+        sink: OctetsSink,
+    ) -> Result<Reader, DdsError> {
+        self.typed_reader((topic, FRAME_TYPE), profile, of_octets(sink))
+    }
+
+    /// The same of a topic given with its type. RustDDS looks at names alone: samples of other
+    /// types on the topic come as well.
+    ///
+    /// # Errors
+    /// [`DdsError`] when RustDDS refuses or has died.
+    pub fn typed_reader(
+        &self,
+        topic: (&str, &str),
         profile: Profile,
         sink: SampleSink,
     ) -> Result<Reader, DdsError> {
@@ -294,17 +359,15 @@ impl Participant {
         super::fault::inject(self, fault)
     }
 
+    /// Makes a reader of a topic, given with its type; whoever has it empties it.
     pub(super) fn raw_reader(
         &self,
-        name: &str,
+        topic: (&str, &str),
         profile: Profile,
-    ) -> Result<no_key::SimpleDataReader<Octets, OctetsAdapter>, DdsError> {
+    ) -> Result<RawReader, DdsError> {
         let subscriber = self.subscriber.clone();
-        self.make("reader", name, profile, move |topic| {
-            subscriber.create_simple_datareader_no_key::<Octets, OctetsAdapter>(
-                topic,
-                Some(profile.qos()),
-            )
+        self.make("reader", topic, profile, move |topic| {
+            subscriber.create_simple_datareader_no_key(topic, Some(profile.qos()))
         })
     }
 
@@ -317,15 +380,14 @@ impl Participant {
     fn make<T: Send + 'static>(
         &self,
         what: &'static str,
-        name: &str,
+        (name, type_name): (&str, &str),
         profile: Profile,
         make: impl FnOnce(&Topic) -> rustdds::dds::CreateResult<T> + Send + 'static,
     ) -> Result<T, DdsError> {
-        let (dds, name) = (self.dds.clone(), name.to_owned());
+        let (dds, name, kind) = (self.dds.clone(), name.to_owned(), type_name.to_owned());
         let (tell, made) = sync_channel(1);
         let making = move || {
             let made = contain(what, || {
-                let kind = FRAME_TYPE.to_owned();
                 make(&dds.create_topic(name, kind, &profile.qos(), TopicKind::NoKey)?)
             });
             // One that nobody waits for any more is dropped.

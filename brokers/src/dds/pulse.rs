@@ -6,12 +6,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::task::{Wake, Waker};
 use std::time::{Duration, Instant, SystemTime};
 
-use bytes::Bytes;
-use rustdds::no_key::SimpleDataReader;
-
 use super::nudge::Nudge;
-use super::sample::{Octets, OctetsAdapter};
-use super::{DdsError, Participant, Profile, Writer, create_error};
+use super::participant::RawReader;
+use super::{DdsError, FRAME_TYPE, Participant, Profile, Writer, create_error};
 
 /// Time between two beats.
 const BEAT: Duration = Duration::from_millis(400);
@@ -43,7 +40,7 @@ pub enum Illness {
 /// announcements on.
 pub struct Pulse {
     writer: Writer,
-    reader: SimpleDataReader<Octets, OctetsAdapter>,
+    reader: RawReader,
     nudge: Nudge,
     answers: Arc<AtomicU64>,
     seen: u64,
@@ -71,7 +68,7 @@ impl Pulse {
         let topic = format!("blaze/pulse/{}", participant.prefix());
         let profile = Profile::best_effort(1);
         Ok(Self {
-            reader: participant.raw_reader(&topic, profile)?,
+            reader: participant.raw_reader((&topic, FRAME_TYPE), profile)?,
             writer: participant.writer(&topic, profile)?,
             nudge: Nudge::new(participant).map_err(create_error("socket"))?,
             answers: Arc::default(),
@@ -105,7 +102,7 @@ impl Pulse {
         if self.last_beat.is_none_or(|at| now.duration_since(at) >= BEAT) {
             self.last_beat = Some(now);
             self.reader.set_waker(Some(Waker::from(Arc::new(Count(Arc::clone(&self.answers))))));
-            self.writer.write(Bytes::from_static(b"?"));
+            self.writer.write(b"?");
         }
         match self.last_answer {
             Some(at) if now.duration_since(at) > HANG => Err(Illness::Hangs),

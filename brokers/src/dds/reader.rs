@@ -2,21 +2,35 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use bytes::Bytes;
-use rustdds::no_key::SimpleDataReader;
 
-use super::participant::prefix_of;
-use super::sample::{Octets, OctetsAdapter};
+use super::participant::{RawReader, prefix_of};
+use super::sample::Cdr;
 use super::{DdsError, GuidPrefix, create_error};
 use crate::wake::unpark_waker;
 
-/// Takes each sample and the participant that wrote it. It runs in the reader's thread: while it
-/// works, at most `depth` samples wait, then the oldest are lost.
-pub type SampleSink = Box<dyn Fn(GuidPrefix, Bytes) + Send>;
+/// A sample, and what its writer says of it.
+pub type Sample = rustdds::no_key::DeserializedCacheChange<Cdr>;
+
+/// Takes each sample. It runs in the reader's thread: while it works, at most `depth` samples wait,
+/// then the oldest are lost.
+pub type SampleSink = Box<dyn Fn(Sample) + Send>;
+
+/// As [`SampleSink`], of the octets of a sample and the participant that wrote it.
+pub type OctetsSink = Box<dyn Fn(GuidPrefix, Bytes) + Send>;
+
+/// Hands the octets of samples to `sink`. A sample that is no sequence of octets is dropped.
+pub(super) fn of_octets(sink: OctetsSink) -> SampleSink {
+    Box::new(move |sample| {
+        if let Some(octets) = sample.sample.octets() {
+            sink(prefix_of(sample.writer_guid), octets);
+        }
+    })
+}
 
 /// A safety net only: RustDDS wakes the thread.
 const LONGEST_SLEEP: Duration = Duration::from_millis(250);
@@ -24,35 +38,26 @@ const LONGEST_SLEEP: Duration = Duration::from_millis(250);
 /// Reads one topic until it is dropped.
 pub struct Reader {
     thread: StoppableThread,
-    malformed: Arc<AtomicU64>,
 }
 
 impl Reader {
     pub(super) fn start(
-        reader: SimpleDataReader<Octets, OctetsAdapter>,
+        reader: RawReader,
         sink: SampleSink,
         failed: Arc<AtomicBool>,
     ) -> Result<Self, DdsError> {
-        let malformed = Arc::<AtomicU64>::default();
-        let counter = Arc::clone(&malformed);
         let thread = StoppableThread::start("dds-reader", failed, move |stop| {
             let waker = unpark_waker();
             while !stop.load(Ordering::Relaxed) {
-                drain(&reader, &sink, &counter);
+                drain(&reader, &sink);
                 reader.set_waker(Some(waker.clone()));
                 // What came before the waker was set woke nobody.
-                if !drain(&reader, &sink, &counter) {
+                if !drain(&reader, &sink) {
                     thread::park_timeout(LONGEST_SLEEP);
                 }
             }
         })?;
-        Ok(Self { thread, malformed })
-    }
-
-    /// Samples that were not a sequence of octets, and were dropped.
-    #[must_use]
-    pub fn malformed(&self) -> u64 {
-        self.malformed.load(Ordering::Relaxed)
+        Ok(Self { thread })
     }
 
     /// Whether its thread still runs.
@@ -63,25 +68,17 @@ impl Reader {
 }
 
 /// Takes what is there. Returns whether there was anything.
-fn drain(
-    reader: &SimpleDataReader<Octets, OctetsAdapter>,
-    sink: &SampleSink,
-    malformed: &AtomicU64,
-) -> bool {
+fn drain(reader: &RawReader, sink: &SampleSink) -> bool {
     let mut any = false;
     reader.drain_read_notifications();
     loop {
         match reader.try_take_one() {
-            Ok(Some(change)) => {
-                any = true;
-                sink(prefix_of(change.writer_guid()), change.into_value().0);
-            }
+            Ok(Some(sample)) => sink(sample),
             Ok(None) => return any,
-            Err(_) => {
-                any = true;
-                malformed.fetch_add(1, Ordering::Relaxed);
-            }
+            // It cannot be read: its encoding is none of CDR.
+            Err(_) => {}
         }
+        any = true;
     }
 }
 

@@ -1,5 +1,6 @@
-//! Samples as IDL `sequence<octet>`: a length of four bytes and the octets. RustDDS adds and strips
-//! the encapsulation.
+//! Samples as they are on the wire: CDR without its encapsulation, which RustDDS adds and strips.
+//!
+//! Those of BlazeAIoT's own topics are IDL `sequence<octet>`: a length of four bytes and the octets.
 
 use std::io;
 
@@ -7,97 +8,123 @@ use bytes::{BufMut, Bytes, BytesMut};
 use rustdds::{RepresentationIdentifier, no_key};
 
 /// Bytes of the length before the octets.
-pub(super) const LENGTH_BYTES: usize = 4;
+const LENGTH_BYTES: usize = 4;
 
-/// The octets of one sample, without the length.
+/// One sample.
 #[derive(Debug, Clone)]
-pub(super) struct Octets(pub(super) Bytes);
-
-/// Serializes [`Octets`] for RustDDS.
-pub(super) struct OctetsAdapter;
-
-/// The decoder of [`OctetsAdapter`].
-#[derive(Clone)]
-pub(super) struct OctetsDecoder;
-
-static ENCODINGS: [RepresentationIdentifier; 2] =
-    [RepresentationIdentifier::CDR_LE, RepresentationIdentifier::CDR_BE];
-
-fn decode(bytes: &[u8], encoding: RepresentationIdentifier) -> io::Result<Octets> {
-    let malformed = || io::Error::new(io::ErrorKind::InvalidData, "not a sequence of octets");
-    let (length, rest) = bytes.split_first_chunk::<LENGTH_BYTES>().ok_or_else(malformed)?;
-    let length = if encoding == RepresentationIdentifier::CDR_BE {
-        u32::from_be_bytes(*length)
-    } else {
-        u32::from_le_bytes(*length)
-    };
-    let length = usize::try_from(length).map_err(|_| malformed())?;
-    // A copy of its own: the slice lies in a receive buffer of 256 KiB, which a small message would
-    // hold.
-    let octets = rest.get(..length).ok_or_else(malformed)?;
-    Ok(Octets(Bytes::copy_from_slice(octets)))
+pub struct Cdr {
+    /// How its bytes are to be read.
+    pub encoding: RepresentationIdentifier,
+    /// The serialized data, with up to three bytes of padding at the end.
+    pub bytes: Bytes,
 }
 
-impl no_key::Decode<'_, Octets> for OctetsDecoder {
-    type Error = io::Error;
-    fn decode_bytes(
-        self,
-        bytes: &[u8],
-        encoding: RepresentationIdentifier,
-    ) -> Result<Octets, io::Error> {
-        decode(bytes, encoding)
+impl Cdr {
+    /// A sample in little-endian CDR.
+    pub(super) fn little(bytes: Bytes) -> Self {
+        Self { encoding: RepresentationIdentifier::CDR_LE, bytes }
+    }
+
+    /// The octets of a `sequence<octet>`; `None` where it is none.
+    pub(super) fn octets(&self) -> Option<Bytes> {
+        let length = *self.bytes.first_chunk::<LENGTH_BYTES>()?;
+        let length = match self.encoding {
+            RepresentationIdentifier::CDR_LE => u32::from_le_bytes(length),
+            RepresentationIdentifier::CDR_BE => u32::from_be_bytes(length),
+            _ => return None,
+        };
+        let end = LENGTH_BYTES.checked_add(usize::try_from(length).ok()?)?;
+        (end <= self.bytes.len()).then(|| self.bytes.slice(LENGTH_BYTES..end))
     }
 }
 
-impl no_key::DeserializerAdapter<Octets> for OctetsAdapter {
+/// Little-endian CDR of a `sequence<octet>` that is made of these parts.
+///
+/// # Errors
+/// Where they have 4 GiB or more together.
+pub fn octet_sequence(parts: &[&[u8]]) -> io::Result<Bytes> {
+    let length = parts.iter().map(|part| part.len()).sum::<usize>();
+    let mut bytes = BytesMut::with_capacity(LENGTH_BYTES + length);
+    bytes.put_u32_le(u32::try_from(length).map_err(io::Error::other)?);
+    parts.iter().for_each(|part| bytes.put_slice(part));
+    Ok(bytes.freeze())
+}
+
+/// Takes samples of any encoding from RustDDS, and gives it those in little-endian CDR.
+pub(super) struct CdrAdapter;
+
+/// The decoder of [`CdrAdapter`].
+#[derive(Clone)]
+pub(super) struct CdrDecoder;
+
+static ENCODINGS: [RepresentationIdentifier; 8] = [
+    RepresentationIdentifier::CDR_LE,
+    RepresentationIdentifier::CDR_BE,
+    RepresentationIdentifier::XCDR2_LE,
+    RepresentationIdentifier::XCDR2_BE,
+    RepresentationIdentifier::D_CDR2_LE,
+    RepresentationIdentifier::D_CDR2_BE,
+    RepresentationIdentifier::PL_XCDR2_LE,
+    RepresentationIdentifier::PL_XCDR2_BE,
+];
+
+impl no_key::Decode<'_, Cdr> for CdrDecoder {
     type Error = io::Error;
-    type Decoded = Octets;
+    fn decode_bytes(self, bytes: &[u8], encoding: RepresentationIdentifier) -> io::Result<Cdr> {
+        // A copy of its own: the slice lies in a receive buffer of 256 KiB, which a small message
+        // would hold.
+        Ok(Cdr { encoding, bytes: Bytes::copy_from_slice(bytes) })
+    }
+}
+
+impl no_key::DeserializerAdapter<Cdr> for CdrAdapter {
+    type Error = io::Error;
+    type Decoded = Cdr;
     fn supported_encodings() -> &'static [RepresentationIdentifier] {
         &ENCODINGS
     }
-    fn transform_decoded(decoded: Octets) -> Octets {
+    fn transform_decoded(decoded: Cdr) -> Cdr {
         decoded
     }
 }
 
-impl no_key::DefaultDecoder<Octets> for OctetsAdapter {
-    type Decoder = OctetsDecoder;
-    const DECODER: OctetsDecoder = OctetsDecoder;
+impl no_key::DefaultDecoder<Cdr> for CdrAdapter {
+    type Decoder = CdrDecoder;
+    const DECODER: CdrDecoder = CdrDecoder;
 }
 
-impl no_key::SerializerAdapter<Octets> for OctetsAdapter {
+impl no_key::SerializerAdapter<Cdr> for CdrAdapter {
     type Error = io::Error;
     fn output_encoding() -> RepresentationIdentifier {
         RepresentationIdentifier::CDR_LE
     }
-    fn to_bytes(sample: &Octets) -> Result<Bytes, io::Error> {
-        let length = u32::try_from(sample.0.len()).map_err(io::Error::other)?;
-        let mut bytes = BytesMut::with_capacity(LENGTH_BYTES + sample.0.len());
-        bytes.put_u32_le(length);
-        bytes.put_slice(&sample.0);
-        Ok(bytes.freeze())
+    fn to_bytes(sample: &Cdr) -> io::Result<Bytes> {
+        Ok(sample.bytes.clone())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rustdds::no_key::SerializerAdapter;
 
     #[test]
     fn octets_survive_and_padding_is_ignored() {
-        let sample = OctetsAdapter::to_bytes(&Octets(Bytes::from_static(b"abcde"))).unwrap();
+        let sample = octet_sequence(&[b"abc", b"de"]).unwrap();
         assert_eq!(&sample[..], b"\x05\0\0\0abcde");
         let mut padded = sample.to_vec();
         padded.extend_from_slice(&[0; 3]);
-        assert_eq!(&decode(&padded, RepresentationIdentifier::CDR_LE).unwrap().0[..], b"abcde");
-        assert_eq!(&decode(b"\0\0\0\x01z", RepresentationIdentifier::CDR_BE).unwrap().0[..], b"z");
+        assert_eq!(&Cdr::little(padded.into()).octets().unwrap()[..], b"abcde");
+        let big = Bytes::from_static(b"\0\0\0\x01z");
+        let encoding = RepresentationIdentifier::CDR_BE;
+        assert_eq!(&Cdr { encoding, bytes: big.clone() }.octets().unwrap()[..], b"z");
+        let encoding = RepresentationIdentifier::XCDR2_BE;
+        assert!(Cdr { encoding, bytes: big }.octets().is_none());
     }
 
     #[test]
     fn a_length_beyond_the_sample_is_refused() {
         for bad in [&b""[..], b"\x01\0\0", b"\x02\0\0\0x", b"\xff\xff\xff\xffx"] {
-            assert!(decode(bad, RepresentationIdentifier::CDR_LE).is_err());
+            assert!(Cdr::little(Bytes::from_static(bad)).octets().is_none());
         }
     }
 }

@@ -10,11 +10,15 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use futures::Stream;
-use rustdds::{DomainParticipant, DomainParticipantStatusEvent as Event, StatusEvented};
+use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
+use rustdds::policy::Durability;
+use rustdds::{
+    DomainParticipant, DomainParticipantStatusEvent as Event, QosPolicies, StatusEvented,
+};
 
-use super::participant::prefix_of;
+use super::participant::{is_mark, prefix_of};
 use super::reader::StoppableThread;
-use super::writer::{EndpointId, endpoint_of};
+use super::writer::{EndpointId, endpoint_of, participant_of};
 use super::{DdsError, GuidPrefix};
 use crate::wake::unpark_waker;
 
@@ -22,39 +26,56 @@ use crate::wake::unpark_waker;
 /// time.
 const RECONCILE: Duration = Duration::from_secs(1);
 
-/// A reader of another participant, of any topic.
+/// A reader or writer of another participant, of any topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct FoundReader {
-    /// Its participant.
-    pub participant: GuidPrefix,
-    /// Its topic.
-    pub topic: String,
-    /// Whether it acknowledges.
-    pub reliable: bool,
-    /// Where it takes data.
-    pub sockets: Vec<SocketAddr>,
-}
-
-/// A writer of another participant, of any topic.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct FoundWriter {
+pub struct FoundEndpoint {
     /// Its identity.
     pub id: EndpointId,
     /// Its topic.
     pub topic: String,
-    /// Whether it repairs losses.
-    pub reliable: bool,
-    /// Whether it keeps samples for late joiners.
-    pub durable: bool,
+    /// The type of the topic, as it names it.
+    pub type_name: String,
+    /// What it offers or asks for.
+    pub qos: QosPolicies,
+    /// What its application says with it.
+    pub user_data: Vec<u8>,
+    /// Where it takes data or acknowledgements; empty where it does so at no UDP address.
+    pub sockets: Vec<SocketAddr>,
+}
+
+impl FoundEndpoint {
+    /// Its participant.
+    #[must_use]
+    pub fn participant(&self) -> GuidPrefix {
+        participant_of(&self.id)
+    }
+
+    /// Whether a writer repairs losses, or a reader acknowledges.
+    #[must_use]
+    pub fn is_reliable(&self) -> bool {
+        self.qos.is_reliable()
+    }
+
+    /// Whether it belongs to a flow.
+    #[must_use]
+    pub fn is_marked(&self) -> bool {
+        self.qos.lifespan().is_some_and(|lifespan| is_mark(lifespan.duration))
+    }
+
+    /// Whether a writer keeps samples for late joiners, or a reader asks for them.
+    #[must_use]
+    pub fn is_durable(&self) -> bool {
+        self.qos.durability().is_some_and(|durability| durability != Durability::Volatile)
+    }
 }
 
 /// All that other participants have.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Endpoints {
     /// Their readers.
-    pub readers: Vec<FoundReader>,
+    pub readers: Vec<FoundEndpoint>,
     /// Their writers.
-    pub writers: Vec<FoundWriter>,
+    pub writers: Vec<FoundEndpoint>,
 }
 
 /// Participants that were lost and are remembered, to know them again.
@@ -144,44 +165,41 @@ fn watch(
 }
 
 fn endpoints(participant: &DomainParticipant, own: GuidPrefix, topics: &str) -> Endpoints {
-    let readers = participant.discovered_readers();
-    let writers = participant.discovered_writers();
     let is_foreign =
         |guid: rustdds::GUID| guid.entity_id.kind().is_user_defined() && prefix_of(guid) != own;
-    Endpoints {
-        readers: readers
-            .iter()
-            .filter(|reader| is_foreign(reader.reader_proxy.remote_reader_guid))
-            .filter(|reader| reader.subscription_topic_data.topic_name().starts_with(topics))
-            .map(|reader| FoundReader {
-                participant: prefix_of(reader.reader_proxy.remote_reader_guid),
-                topic: reader.subscription_topic_data.topic_name().clone(),
-                reliable: reader.subscription_topic_data.qos().is_reliable(),
-                sockets: reader
-                    .reader_proxy
-                    .unicast_locator_list
-                    .iter()
-                    .filter(|locator| locator.is_udp())
-                    .map(|locator| SocketAddr::from(*locator))
-                    .collect(),
-            })
-            .collect(),
-        writers: writers
-            .iter()
-            .filter(|writer| is_foreign(writer.writer_proxy.remote_writer_guid))
-            .filter(|writer| writer.publication_topic_data.topic_name.starts_with(topics))
-            .map(|writer| FoundWriter {
-                id: endpoint_of(writer.writer_proxy.remote_writer_guid),
-                topic: writer.publication_topic_data.topic_name.clone(),
-                reliable: matches!(
-                    writer.publication_topic_data.reliability,
-                    Some(rustdds::policy::Reliability::Reliable { .. })
-                ),
-                durable: writer
-                    .publication_topic_data
-                    .durability
-                    .is_some_and(|durability| durability != rustdds::policy::Durability::Volatile),
-            })
-            .collect(),
+    let readers = participant.discovered_readers().into_iter().filter(|reader| {
+        is_foreign(reader.reader_proxy.remote_reader_guid)
+            && reader.subscription_topic_data.topic_name().starts_with(topics)
+    });
+    let writers = participant.discovered_writers().into_iter().filter(|writer| {
+        is_foreign(writer.writer_proxy.remote_writer_guid)
+            && writer.publication_topic_data.topic_name.starts_with(topics)
+    });
+    Endpoints { readers: readers.map(reader).collect(), writers: writers.map(writer).collect() }
+}
+
+fn reader(found: DiscoveredReaderData) -> FoundEndpoint {
+    let topic = &found.subscription_topic_data;
+    let locators = found.reader_proxy.unicast_locator_list.iter().filter(|it| it.is_udp());
+    FoundEndpoint {
+        id: endpoint_of(found.reader_proxy.remote_reader_guid),
+        topic: topic.topic_name().clone(),
+        type_name: topic.type_name().clone(),
+        qos: topic.qos(),
+        user_data: found.user_data,
+        sockets: locators.map(|locator| (*locator).into()).collect(),
+    }
+}
+
+fn writer(found: DiscoveredWriterData) -> FoundEndpoint {
+    let qos = found.publication_topic_data.qos();
+    let locators = found.writer_proxy.unicast_locator_list.iter().filter(|it| it.is_udp());
+    FoundEndpoint {
+        id: endpoint_of(found.writer_proxy.remote_writer_guid),
+        topic: found.publication_topic_data.topic_name,
+        type_name: found.publication_topic_data.type_name,
+        qos,
+        user_data: found.user_data,
+        sockets: locators.map(|locator| (*locator).into()).collect(),
     }
 }

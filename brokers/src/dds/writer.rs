@@ -7,12 +7,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rustdds::dds::WriteError;
-use rustdds::{
-    DataWriterStatus, RTPSEntity, StatusEvented, Timestamp, WriteOptionsBuilder, no_key,
-};
+use rustdds::{DataWriterStatus, RTPSEntity, StatusEvented, WriteOptionsBuilder, no_key};
 
 use super::GuidPrefix;
-use super::sample::{Octets, OctetsAdapter};
+use super::sample::{Cdr, CdrAdapter, octet_sequence};
 
 /// Identity of a reader or writer on the wire: its participant's and four bytes.
 pub type EndpointId = [u8; 16];
@@ -31,8 +29,8 @@ pub(super) fn participant_of(endpoint: &EndpointId) -> GuidPrefix {
 /// What became of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Written {
-    /// RustDDS has it.
-    Taken,
+    /// RustDDS has it, under this sequence number.
+    Taken(i64),
     /// Nobody reads the topic.
     NoReader,
     /// The window is full: a reader has not acknowledged, or the socket takes nothing.
@@ -51,7 +49,7 @@ const STATUS_EVENTS: usize = 4;
 
 /// Writes one topic. Never waits.
 pub struct Writer {
-    writer: no_key::DataWriter<Octets, OctetsAdapter>,
+    writer: no_key::DataWriter<Cdr, CdrAdapter>,
     matched: AtomicBool,
     /// Late joiners get what was written before they came, so it is written without a reader, too.
     keeps: bool,
@@ -61,35 +59,34 @@ pub struct Writer {
 impl Writer {
     /// `keeps`: late joiners get what was written before they came.
     pub(super) fn new(
-        writer: no_key::DataWriter<Octets, OctetsAdapter>,
+        writer: no_key::DataWriter<Cdr, CdrAdapter>,
         keeps: bool,
         failed: Arc<AtomicBool>,
     ) -> Self {
         Self { writer, matched: AtomicBool::new(false), keeps, failed }
     }
 
-    /// Hands a sample to RustDDS. Returns whether it was taken, as [`write_at`](Self::write_at)
-    /// tells.
-    pub fn write(&self, octets: Bytes) -> bool {
-        self.write_at(octets, None) == Written::Taken
+    /// Hands octets to RustDDS, as a sample of [`FRAME_TYPE`](super::FRAME_TYPE). Returns whether
+    /// they were taken, as [`write_cdr`](Self::write_cdr) tells.
+    pub fn write(&self, octets: &[u8]) -> bool {
+        let cdr = octet_sequence(&[octets]);
+        let write = |cdr| self.write_cdr(cdr, WriteOptionsBuilder::new());
+        cdr.is_ok_and(|cdr| matches!(write(cdr), Written::Taken(_)))
     }
 
-    /// Hands a sample to RustDDS: not without a reader, unless it is kept for late joiners, and not
-    /// into the full window of a reliable writer. Best effort lets the oldest that still wait give
-    /// way. `written` travels with the sample.
-    pub fn write_at(&self, octets: Bytes, written: Option<Timestamp>) -> Written {
+    /// Hands a sample in little-endian CDR to RustDDS: not without a reader, unless it is kept for
+    /// late joiners, and not into the full window of a reliable writer. Best effort lets the oldest
+    /// that still wait give way. `options` travel with the sample.
+    pub fn write_cdr(&self, cdr: Bytes, options: WriteOptionsBuilder) -> Written {
         self.contain(|| {
             if !(self.is_matched_now() || self.keeps) {
                 return Some(Written::NoReader);
             }
             // Best effort gives up a sample of which the socket cannot take the rest at once.
-            let waits = octets.len() > AT_ONCE_BYTES;
-            let mut options = WriteOptionsBuilder::new().best_effort_may_block(waits);
-            if let Some(written) = written {
-                options = options.source_timestamp(written);
-            }
-            match self.writer.write_with_options(Octets(octets), options.build()) {
-                Ok(_) => Some(Written::Taken),
+            let waits = cdr.len() > AT_ONCE_BYTES;
+            let options = options.best_effort_may_block(waits).build();
+            match self.writer.write_with_options(Cdr::little(cdr), options) {
+                Ok(sample) => Some(Written::Taken(sample.sequence_number.into())),
                 Err(WriteError::WouldBlock { .. }) => Some(Written::Full),
                 Err(_) => Some(Written::Failed),
             }

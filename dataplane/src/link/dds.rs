@@ -231,7 +231,7 @@ impl DdsTransport {
                 .read()
                 .get(to)
                 .and_then(|writers| writers[class as usize].as_ref())
-                .is_some_and(|writer| writer.write(datagram));
+                .is_some_and(|writer| writer.write(&datagram));
         if sent {
             SendOutcome::Sent
         } else {

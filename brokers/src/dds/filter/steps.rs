@@ -16,6 +16,8 @@ const NACK_FRAG: u32 = 0x12;
 const HEARTBEAT_FRAG: u32 = 0x13;
 const DATA: u32 = 0x15;
 const DATA_FRAG: u32 = 0x16;
+/// A kind of its own, which Fast DDS puts at the end of its datagrams.
+const FAST_DDS: u32 = 0x80;
 
 /// Bit of the first word of a submessage (kind, flags, length): little endian.
 const LITTLE: u32 = 0x0001_0000;
@@ -100,9 +102,10 @@ pub(super) fn quick_step(asm: &mut Assembler, other: Label) {
 
 /// Looks at one little-endian submessage of the kinds that others than RustDDS pack into one
 /// datagram. A GAP may be as wide as a HEARTBEAT.
-pub(super) fn packed_step(asm: &mut Assembler, other: Label) {
+pub(super) fn packed_step(asm: &mut Assembler, limits: Limits, other: Label) {
     pass_at_end(asm);
-    let [gap, range, acknack, numbered, known, bad, next] = [(); 7].map(|()| asm.label());
+    let [gap, range, acknack, nack_frag, numbered, known, bad, next] =
+        [(); 8].map(|()| asm.label());
     asm.op(Op::LoadWord, 0);
     asm.op(Op::And, 0xff00_0000 | LITTLE);
     asm.when(Test::Equal, DATA << 24 | LITTLE, known);
@@ -111,7 +114,16 @@ pub(super) fn packed_step(asm: &mut Assembler, other: Label) {
     asm.when(Test::Equal, HEARTBEAT << 24 | LITTLE, range);
     asm.when(Test::Equal, ACKNACK << 24 | LITTLE, acknack);
     asm.when(Test::Equal, GAP << 24 | LITTLE, gap);
+    asm.when(Test::Equal, NACK_FRAG << 24 | LITTLE, nack_frag);
+    asm.when(Test::Equal, FAST_DDS << 24 | LITTLE, known);
     asm.jump(other);
+
+    asm.place(nack_frag);
+    not_zero(asm, 20, bad);
+    asm.when(Test::AnyBit, limits.nack_fragment.swap_bytes(), bad);
+    asm.op(Op::LoadWord, 24);
+    asm.when(Test::AnyBit, (!MAX_BITS).swap_bytes(), bad);
+    asm.jump(numbered);
 
     asm.place(acknack);
     asm.op(Op::LoadWord, 20);

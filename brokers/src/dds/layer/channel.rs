@@ -10,7 +10,6 @@ use std::time::{Duration, Instant};
 use blaze_domain::names::ChannelName;
 use parking_lot::{Mutex, RwLock};
 use rustdds::Timestamp;
-use rustdds::no_key::SimpleDataReader;
 use tokio::sync::oneshot;
 
 use super::deliver::{Kind, Progress, deliver};
@@ -18,8 +17,8 @@ use super::kept::History;
 use super::names;
 use super::seen::Seen;
 use super::shared::Shared;
+use crate::dds::participant::RawReader;
 use crate::dds::reader::StoppableThread;
-use crate::dds::sample::{Octets, OctetsAdapter};
 use crate::dds::{DdsError, EndpointId, Profile};
 use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
 
@@ -33,8 +32,6 @@ const LONGEST_SLEEP: Duration = Duration::from_millis(250);
 const SMALL_DEPTH: u16 = 1024;
 /// The same where they may be large.
 const LARGE_DEPTH: u16 = 32;
-
-pub(super) type RawReader = SimpleDataReader<Octets, OctetsAdapter>;
 
 /// The readers of a channel, and how far they have come.
 #[derive(Default)]
@@ -75,11 +72,11 @@ struct Ready {
 
 impl Channel {
     pub(super) fn profile(&self, reliable: bool) -> Profile {
+        let depth = if self.large { LARGE_DEPTH } else { SMALL_DEPTH };
         Profile {
             reliable,
-            depth: if self.large { LARGE_DEPTH } else { SMALL_DEPTH },
             transient_local: self.with_kept && reliable,
-            window: 0,
+            ..Profile::best_effort(depth)
         }
     }
 
@@ -181,15 +178,11 @@ impl Channel {
         reader.drain_read_notifications();
         for _ in 0..TURN {
             match reader.try_take_one() {
-                Ok(Some(sample)) => deliver(shared, self, kind, progress, sample),
+                Ok(Some(sample)) => deliver(shared, self, kind, progress, &sample),
                 Ok(None) => return false,
                 Err(error) => {
                     shared.counts.lock().malformed += 1;
-                    tracing::debug!(
-                        topic = &*self.topic,
-                        %error,
-                        "a sample is no sequence of octets",
-                    );
+                    tracing::debug!(topic = &*self.topic, %error, "a sample cannot be read");
                 }
             }
         }

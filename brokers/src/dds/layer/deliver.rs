@@ -11,7 +11,7 @@ use super::kept::History;
 use super::seen::{Moment, Seen};
 use super::shared::{Shared, WriterFacts};
 use crate::dds::EndpointId;
-use crate::dds::sample::Octets;
+use crate::dds::sample::Cdr;
 use crate::dds::writer::endpoint_of;
 use crate::port::{Content, Received};
 
@@ -53,7 +53,7 @@ pub(super) fn deliver(
     channel: &Channel,
     kind: Kind,
     progress: &mut Progress<'_>,
-    sample: DeserializedCacheChange<Octets>,
+    sample: &DeserializedCacheChange<Cdr>,
 ) {
     let writer = endpoint_of(sample.writer_guid());
     let facts = shared.writers.read().get(&writer).copied();
@@ -69,7 +69,7 @@ pub(super) fn deliver(
         return;
     };
     let own = facts.is_some_and(|facts| facts.own);
-    let moment = moment_of(shared, facts, writer, &sample);
+    let moment = moment_of(shared, facts, writer, sample);
     let is_old = moment.is_some_and(|moment| moment.is_old(nanos(opened), own, seen));
     if missing > 0 && !own && !is_old && facts.is_some_and(|facts| facts.reliable) {
         // RustDDS acknowledges what it takes in, and drops the oldest that were not read in time.
@@ -82,7 +82,12 @@ pub(super) fn deliver(
     } else if own || is_old || !since_opened {
         return;
     }
-    let content = Content::of(channel.is_reserved, sample.into_value().0);
+    let Some(octets) = sample.sample.octets() else {
+        shared.counts.lock().malformed += 1;
+        tracing::debug!(topic = &*channel.topic, "a sample is no sequence of octets");
+        return;
+    };
+    let content = Content::of(channel.is_reserved, octets);
     let at = Instant::now();
     let mut received = Received::live(content, at);
     match moment {
@@ -108,7 +113,7 @@ fn moment_of(
     shared: &Shared,
     facts: Option<WriterFacts>,
     writer: EndpointId,
-    sample: &DeserializedCacheChange<Octets>,
+    sample: &DeserializedCacheChange<Cdr>,
 ) -> Option<Moment> {
     let facts = facts.filter(|facts| facts.durable)?;
     Some(Moment {

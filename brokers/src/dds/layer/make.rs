@@ -6,11 +6,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_domain::MAX_PAYLOAD_BYTES;
-use bytes::Bytes;
 use rustdds::Timestamp;
 use serde_json::{Value, json};
 
-use super::channel::{Channel, RawReader};
+use super::channel::Channel;
 use super::deliver::nanos;
 use super::names::ALIVE;
 use super::near::Near;
@@ -19,11 +18,10 @@ use super::probe::Probe;
 use super::shared::{Shared, WriterFacts};
 use super::slot::Slot;
 use crate::dds::farewell::Farewell;
-use crate::dds::participant::prefix_of;
-use crate::dds::writer::participant_of;
+use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
-    DdsError, EndpointWatch, Endpoints, FoundWriter, GuidPrefix, Illness, Participant,
-    ParticipantConfig, Profile, Pulse, Writer, create_error,
+    DdsError, EndpointWatch, Endpoints, FRAME_TYPE, FoundEndpoint, GuidPrefix, Illness,
+    Participant, ParticipantConfig, Profile, Pulse, Writer, create_error,
 };
 
 /// Between two signs of life.
@@ -74,7 +72,7 @@ impl Generation {
                 }),
             )?,
             pulse,
-            signs: participant.raw_reader(ALIVE, profile)?,
+            signs: participant.raw_reader((ALIVE, FRAME_TYPE), profile)?,
             sign: participant.writer(ALIVE, profile)?,
             next_sign: now,
             probes: HashMap::new(),
@@ -112,17 +110,16 @@ impl Generation {
 
     /// Makes the readers of a channel that are missing.
     pub(super) fn open(&self, channel: &Channel, best_effort: bool) -> Result<(), DdsError> {
+        let topic = (&*channel.topic, FRAME_TYPE);
         let mut readers = channel.readers.lock();
         let is_new = readers.reliable.is_none();
         if is_new {
             // What is taken from now on is new, however long making the reader takes.
             readers.opened = Some(Timestamp::now());
-            readers.reliable =
-                Some(self.participant.raw_reader(&channel.topic, channel.profile(true))?);
+            readers.reliable = Some(self.participant.raw_reader(topic, channel.profile(true))?);
         }
         if best_effort && readers.best_effort.is_none() {
-            readers.best_effort =
-                Some(self.participant.raw_reader(&channel.topic, channel.profile(false))?);
+            readers.best_effort = Some(self.participant.raw_reader(topic, channel.profile(false))?);
         } else if !is_new {
             return Ok(());
         }
@@ -140,7 +137,7 @@ impl Generation {
                 self.presence.lock().gone(now).map(|prefix| prefix.to_string()).collect();
             let time_ns = u64::try_from(nanos(Timestamp::now())).unwrap_or(0);
             let sign = json!({ "time_ns": time_ns, "gone": gone });
-            self.sign.write(Bytes::from(sign.to_string()));
+            self.sign.write(sign.to_string().as_bytes());
         }
         let own = self.participant.prefix();
         let mut given_up = false;
@@ -150,9 +147,8 @@ impl Generation {
             let Some(sample) = taken else { break };
             let from = prefix_of(sample.writer_guid());
             let received = nanos(sample.receive_instant);
-            let Ok(sign) = serde_json::from_slice::<Value>(&sample.into_value().0) else {
-                continue;
-            };
+            let octets = sample.sample.octets().unwrap_or_default();
+            let Ok(sign) = serde_json::from_slice::<Value>(&octets) else { continue };
             if from == own {
                 continue;
             }
@@ -215,20 +211,20 @@ impl Generation {
 fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
     let mut best_effort = HashSet::new();
-    let sign = |writer: &FoundWriter| (writer.topic == ALIVE).then(|| participant_of(&writer.id));
+    let sign = |writer: &FoundEndpoint| (writer.topic == ALIVE).then(|| writer.participant());
     let alive: HashSet<GuidPrefix> = endpoints.writers.iter().filter_map(sign).collect();
     {
         let mut writers = shared.writers.write();
         writers.retain(|_, facts| facts.own);
         for writer in &endpoints.writers {
             let facts = WriterFacts {
-                reliable: writer.reliable,
-                durable: writer.durable,
+                reliable: writer.is_reliable(),
+                durable: writer.is_durable(),
                 own: false,
-                signs: alive.contains(&participant_of(&writer.id)),
+                signs: alive.contains(&writer.participant()),
             };
             writers.insert(writer.id, facts);
-            if !writer.reliable {
+            if !writer.is_reliable() {
                 best_effort.insert(writer.topic.clone());
             }
         }

@@ -12,7 +12,7 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use super::near::Near;
-use crate::dds::{FoundReader, GuidPrefix};
+use crate::dds::{FoundEndpoint, GuidPrefix};
 
 /// Signs of life come every 500 ms.
 pub(super) const SILENT: Duration = Duration::from_secs(2);
@@ -51,13 +51,13 @@ impl Presence {
     }
 
     /// Takes over which readers there are.
-    pub(super) fn set_readers(&mut self, readers: &[FoundReader]) {
+    pub(super) fn set_readers(&mut self, readers: &[FoundEndpoint]) {
         let mut found: BTreeMap<GuidPrefix, (BTreeSet<SocketAddr>, BTreeSet<String>)> =
             BTreeMap::new();
         for reader in readers {
-            let (sockets, topics) = found.entry(reader.participant).or_default();
+            let (sockets, topics) = found.entry(reader.participant()).or_default();
             sockets.extend(reader.sockets.iter().copied());
-            if reader.reliable {
+            if reader.is_reliable() {
                 topics.insert(reader.topic.clone());
             }
         }
@@ -215,6 +215,8 @@ impl Clock {
 
 #[cfg(test)]
 mod tests {
+    use rustdds::QosPolicies;
+
     use super::*;
 
     fn prefix(number: u8) -> GuidPrefix {
@@ -229,15 +231,19 @@ mod tests {
         presence([127, 0, 0, 1], [255, 0, 0, 0])
     }
 
-    fn reader(participant: u8, topic: &str, port: u16) -> FoundReader {
+    fn reader(participant: u8, topic: &str, port: u16) -> FoundEndpoint {
         reader_at(participant, topic, vec![([127, 0, 0, 1], port).into()])
     }
 
-    fn reader_at(participant: u8, topic: &str, sockets: Vec<SocketAddr>) -> FoundReader {
-        FoundReader {
-            participant: prefix(participant),
+    fn reader_at(participant: u8, topic: &str, sockets: Vec<SocketAddr>) -> FoundEndpoint {
+        let mut id = [0; 16];
+        id[..12].copy_from_slice(&prefix(participant).0);
+        FoundEndpoint {
+            id,
             topic: topic.to_owned(),
-            reliable: true,
+            type_name: String::new(),
+            qos: QosPolicies::builder().reliable(rustdds::Duration::ZERO).build(),
+            user_data: Vec::new(),
             sockets,
         }
     }

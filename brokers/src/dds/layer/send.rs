@@ -7,8 +7,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, WriterId};
-use blaze_proto::Frame;
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::Bytes;
 use lru::LruCache;
 use parking_lot::Mutex;
 
@@ -17,6 +16,7 @@ use super::shared::Shared;
 use super::slot::{Attempt, Slot, SlotKey};
 use crate::dds::DdsError;
 use crate::dds::reader::StoppableThread;
+use crate::dds::sample::octet_sequence;
 use crate::outbox::{Body, Fate, Waiting};
 use crate::port::{Content, PublisherOptions};
 use crate::wake::wait;
@@ -236,7 +236,7 @@ fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<F
         return Some(Fate::Dropped(reason));
     }
     let slot = waiting.to.slot_of(shared, &waiting.body);
-    match slot.write(now, || octets(waiting, now)) {
+    match slot.write(now, || cdr(waiting, now)) {
         Attempt::Done => {
             let is_reserved = !slot.key.topic.starts_with(names::USER_PREFIX);
             shared.channels.deliver_own(&slot.key.topic, || content(waiting, now, is_reserved));
@@ -255,15 +255,15 @@ fn content(waiting: &Waiting<Target>, now: Instant, is_reserved: bool) -> Conten
     }
 }
 
-/// The message as one piece.
-fn octets(waiting: &Waiting<Target>, now: Instant) -> Bytes {
-    let frame: Frame = match &waiting.body {
-        Body::Bare(payload) => return payload.clone(),
-        Body::Frame(frame) => Waiting::<Target>::aged(frame, waiting.since, now),
+/// The message as one sample.
+fn cdr(waiting: &Waiting<Target>, now: Instant) -> Bytes {
+    let sequence = match &waiting.body {
+        Body::Bare(payload) => octet_sequence(&[payload]),
+        Body::Frame(frame) => {
+            let frame = Waiting::<Target>::aged(frame, waiting.since, now);
+            octet_sequence(&[&frame.head_to_write(), frame.payload()])
+        }
     };
-    let head = frame.head_to_write();
-    let mut bytes = BytesMut::with_capacity(head.len() + frame.payload().len());
-    bytes.put_slice(&head);
-    bytes.put_slice(frame.payload());
-    bytes.freeze()
+    // Nothing in the queue is near the 4 GiB of which a sequence can tell the length.
+    sequence.unwrap_or_default()
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::WriterId;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rustdds::Timestamp;
+use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use crate::dds::{Profile, Writer, Written};
 
@@ -53,6 +53,7 @@ impl SlotKey {
             depth: if self.depth > 0 { self.depth } else { depth },
             transient_local: self.depth > 0,
             window: if self.reliable { window } else { 0 },
+            ..Profile::best_effort(depth)
         }
     }
 }
@@ -98,7 +99,7 @@ impl Drop for Slot {
 
 impl Slot {
     /// Writes a sample, if its writer is there and can take it.
-    pub(super) fn write(&self, now: Instant, octets: impl FnOnce() -> Bytes) -> Attempt {
+    pub(super) fn write(&self, now: Instant, cdr: impl FnOnce() -> Bytes) -> Attempt {
         let mut state = self.state.lock();
         let state = &mut *state;
         let Some(writer) = &state.writer else {
@@ -116,9 +117,12 @@ impl Slot {
             }
             state.settled = true;
         }
-        let written = (self.key.depth > 0).then(Timestamp::now);
-        match writer.write_at(octets(), written) {
-            Written::Taken | Written::NoReader => {
+        let mut options = WriteOptionsBuilder::new();
+        if self.key.depth > 0 {
+            options = options.source_timestamp(Timestamp::now());
+        }
+        match writer.write_cdr(cdr(), options) {
+            Written::Taken(_) | Written::NoReader => {
                 state.full_since = None;
                 Attempt::Done
             }

@@ -11,7 +11,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    DdsError, EndpointWatch, FoundReader, GuidPrefix, Illness, Participant, ParticipantConfig,
+    DdsError, EndpointWatch, FoundEndpoint, GuidPrefix, Illness, Participant, ParticipantConfig,
     Pulse, Reader, Writer, lay_aside,
 };
 use blaze_domain::Priority;
@@ -344,7 +344,7 @@ struct Found {
 type Known = BTreeMap<Endpoint, Found>;
 
 /// Compares all remote readers with those known before and tells the differences.
-fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[FoundReader]) {
+fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[FoundEndpoint]) {
     let now = Instant::now();
     let mut homes: HashMap<GuidPrefix, Vec<Ipv4Addr>> = HashMap::new();
     let mut found = Known::new();
@@ -352,7 +352,7 @@ fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[F
         let Some((endpoint, class)) = parse_topic(&reader.topic) else {
             continue;
         };
-        let addresses = homes.entry(reader.participant).or_default();
+        let addresses = homes.entry(reader.participant()).or_default();
         for socket in &reader.sockets {
             if let IpAddr::V4(address) = socket.ip()
                 && !addresses.contains(&address)
@@ -363,7 +363,7 @@ fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[F
         if endpoint != *own {
             let since = known.get(&endpoint).map_or(now, |known| known.since);
             let entry = found.entry(endpoint).or_insert(Found {
-                participant: reader.participant,
+                participant: reader.participant(),
                 classes: [false; CLASSES],
                 since,
             });

@@ -36,7 +36,7 @@ async fn a_writer_finds_its_reader_behind_a_crowd_of_others() {
     for (writer, text) in [(&first, "first"), (&second, "second")] {
         eventually(text, || writer.is_matched().then_some(())).await;
         eventually(text, || {
-            writer.write(Bytes::from(text));
+            writer.write(text.as_bytes());
             arrivals.try_iter().find(|octets| octets == text)
         })
         .await;

@@ -4,10 +4,9 @@
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::dds::{Participant, ParticipantConfig, Profile, Written};
+use blaze_brokers::dds::{Participant, ParticipantConfig, Profile, Written, octet_sequence};
 use blaze_brokers::{Broker, Content, PublisherOptions, Received, SubscribeOptions, Subscription};
-use bytes::Bytes;
-use rustdds::Timestamp;
+use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use super::support::{DEADLINE, Domain, WITH_KEPT, eventually, frame};
 
@@ -29,11 +28,14 @@ async fn a_plain_program_whose_clock_is_an_hour_behind_is_heard() {
     const LIVE: usize = 10;
     let domain = Domain::start();
     let plain = Participant::start(ParticipantConfig::new(domain.id, Ipv4Addr::LOCALHOST)).unwrap();
-    let profile = Profile { reliable: true, depth: 4, transient_local: true, window: 1024 };
+    let profile =
+        Profile { reliable: true, transient_local: true, window: 1024, ..Profile::best_effort(4) };
     let writer = plain.writer("bt/clock", profile).unwrap();
     let write = |octets: &'static [u8], seconds: i32| {
         let written = Timestamp::now() - rustdds::Duration::from_secs(3_600 + seconds);
-        assert_eq!(writer.write_at(Bytes::from_static(octets), Some(written)), Written::Taken);
+        let options = WriteOptionsBuilder::new().source_timestamp(written);
+        let result = writer.write_cdr(octet_sequence(&[octets]).unwrap(), options);
+        assert!(matches!(result, Written::Taken(_)), "{result:?}");
     };
     for seconds in [4, 3, 2, 1] {
         write(b"kept", seconds);

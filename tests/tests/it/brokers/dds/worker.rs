@@ -60,7 +60,8 @@ async fn whoever_comes_late_gets_the_last_notices_as_they_are() {
     let mut kept = late.subscribe(&channel, WITH_KEPT).await.unwrap();
     assert_eq!(until(&mut kept, "2").await, ["1", "2"]);
     let plain = Participant::start(ParticipantConfig::new(domain.id, Ipv4Addr::LOCALHOST)).unwrap();
-    let profile = Profile { reliable: true, depth: 64, transient_local: true, window: 0 };
+    let profile =
+        Profile { reliable: true, transient_local: true, window: 0, ..Profile::best_effort(64) };
     let heard = Arc::new(Mutex::new(BTreeSet::new()));
     let noted = Arc::clone(&heard);
     let sink = Box::new(move |_, octets: Bytes| {

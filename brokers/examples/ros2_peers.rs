@@ -1,0 +1,230 @@
+//! What ROS 2 nodes and RustDDS make of one another: the facts that the ROS 2 adapter is built on.
+//!
+//! ```text
+//! ros2_peers DOMAIN echo SECONDS      rt/big -> rt/big_reply, as raw CDR; gaps, doubles, what the kernel dropped
+//! ros2_peers DOMAIN late SECONDS      joins rt/counter as a reliable, volatile reader; the first and last sample, gaps
+//! ros2_peers DOMAIN serve SECONDS     answers rq/add_two_intsRequest, with the identity of the request in the reply
+//! ros2_peers DOMAIN call COUNT        calls rq/add_two_intsRequest and looks for its identity in the replies
+//! ros2_peers DOMAIN watch SECONDS     prints the endpoints of others
+//! ```
+//!
+//! All on 127.0.0.1. Figures of runs against Fast DDS and Cyclone: `docs/design/ros2.md`.
+
+use std::collections::HashMap;
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::{Duration, Instant};
+
+use blaze_brokers::dds::{
+    DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Writer, Written,
+};
+use bytes::{BufMut, Bytes, BytesMut};
+use rustdds::WriteOptionsBuilder;
+use rustdds::rpc::SampleIdentity;
+
+const BIG: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
+const COUNTER: &str = "std_msgs::msg::dds_::UInt64_";
+const REQUEST: &str = "test_msgs::srv::dds_::BasicTypes_Request_";
+const REPLY: &str = "test_msgs::srv::dds_::BasicTypes_Response_";
+
+type Error = Box<dyn std::error::Error>;
+
+fn main() -> Result<(), Error> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [domain, task, count] = &arguments[..] else {
+        return Err("usage: ros2_peers DOMAIN echo|late|serve|call|watch SECONDS|COUNT".into());
+    };
+    let mut config = ParticipantConfig::new(domain.parse()?, Ipv4Addr::LOCALHOST);
+    config.largest_sample = 16 << 20;
+    config.repairs_fragments = true;
+    config.any_vendor = true;
+    config.send_buffer_bytes = 4 << 20;
+    let participant = Participant::start(config)?;
+    let count = count.parse()?;
+    match task.as_str() {
+        "echo" => echo(&participant, Duration::from_secs(count))?,
+        "late" => late(&participant, Duration::from_secs(count))?,
+        "serve" => serve(&participant, Duration::from_secs(count))?,
+        "call" => call(&participant, count)?,
+        "watch" => watch(&participant, Duration::from_secs(count))?,
+        other => return Err(format!("unknown task {other}").into()),
+    }
+    println!("dropped by the kernel: {}", participant.dropped_by_kernel());
+    Ok(())
+}
+
+fn reliable(depth: u16) -> Profile {
+    Profile { reliable: true, window: 64, marked: true, ..Profile::best_effort(depth) }
+}
+
+/// A reader whose samples come out of a queue.
+fn read(
+    participant: &Participant,
+    topic: (&str, &str),
+    profile: Profile,
+) -> Result<(Reader, Receiver<Sample>), DdsError> {
+    let (sender, receiver): (SyncSender<Sample>, _) = sync_channel(4096);
+    let sink = Box::new(move |sample| drop(sender.send(sample)));
+    Ok((participant.typed_reader(topic, profile, sink)?, receiver))
+}
+
+fn write(writer: &Writer, cdr: &Bytes, related: Option<SampleIdentity>) -> Option<i64> {
+    let until = Instant::now() + Duration::from_secs(2);
+    while Instant::now() < until {
+        let options = WriteOptionsBuilder::new().related_sample_identity_opt(related);
+        match writer.write_cdr(cdr.clone(), options) {
+            Written::Taken(sequence) => return Some(sequence),
+            Written::NoReader | Written::Full => std::thread::sleep(Duration::from_millis(1)),
+            Written::Failed => return None,
+        }
+    }
+    None
+}
+
+/// Sequence numbers of one writer: what is missing, and what came again.
+#[derive(Default)]
+struct Numbers {
+    first: i64,
+    last: i64,
+    count: u64,
+    missing: i64,
+    again: u64,
+}
+
+impl Numbers {
+    fn note(&mut self, sequence: i64) {
+        self.count += 1;
+        if self.first == 0 {
+            self.first = sequence;
+        } else if sequence <= self.last {
+            self.again += 1;
+        } else {
+            self.missing += sequence - self.last - 1;
+        }
+        self.last = self.last.max(sequence);
+    }
+
+    fn print(&self) {
+        let Self { first, last, count, missing, again } = self;
+        println!("{count} samples, {first} to {last}, {missing} missing, {again} again");
+    }
+}
+
+fn echo(participant: &Participant, time: Duration) -> Result<(), Error> {
+    let (_reader, samples) = read(participant, ("rt/big", BIG), reliable(16))?;
+    let writer = participant.typed_writer(("rt/big_reply", BIG), reliable(16))?;
+    let (mut numbers, mut bytes, mut unsent) = (Numbers::default(), 0, 0);
+    let until = Instant::now() + time;
+    while let Ok(sample) = samples.recv_timeout(until.saturating_duration_since(Instant::now())) {
+        numbers.note(sample.sequence_number.into());
+        bytes += sample.sample.bytes.len();
+        if write(&writer, &sample.sample.bytes, None).is_none() {
+            unsent += 1;
+        }
+    }
+    numbers.print();
+    println!("{bytes} bytes, {unsent} replies not taken");
+    Ok(())
+}
+
+fn late(participant: &Participant, time: Duration) -> Result<(), Error> {
+    // The participants have met: what is left is how long the endpoints take.
+    std::thread::sleep(Duration::from_secs(3));
+    let begin = Instant::now();
+    let (_reader, samples) = read(participant, ("rt/counter", COUNTER), reliable(4096))?;
+    let mut numbers = Numbers::default();
+    let mut first = None;
+    while let Ok(sample) = samples.recv_timeout(time.saturating_sub(begin.elapsed())) {
+        first.get_or_insert_with(|| begin.elapsed());
+        numbers.note(sample.sequence_number.into());
+    }
+    println!("first sample after {first:?}");
+    numbers.print();
+    Ok(())
+}
+
+fn serve(participant: &Participant, time: Duration) -> Result<(), Error> {
+    let request = ("rq/basic_typesRequest", REQUEST);
+    let (_reader, samples) = read(participant, request, reliable(64))?;
+    let writer = participant.typed_writer(("rr/basic_typesReply", REPLY), reliable(64))?;
+    let mut served = 0;
+    let until = Instant::now() + time;
+    while let Ok(sample) = samples.recv_timeout(until.saturating_duration_since(Instant::now())) {
+        // Fast DDS looks for the identity of its reader of replies, if the request names that, with
+        // the number of the request.
+        let reader = sample.related_sample_identity().map(|related| related.writer_guid);
+        let identity = SampleIdentity {
+            writer_guid: reader.unwrap_or(sample.writer_guid),
+            sequence_number: sample.sequence_number,
+        };
+        if write(&writer, &sample.sample.bytes, Some(identity)).is_some() {
+            served += 1;
+        }
+    }
+    println!("{served} requests answered");
+    Ok(())
+}
+
+fn call(participant: &Participant, count: u64) -> Result<(), Error> {
+    let reply = ("rr/basic_typesReply", REPLY);
+    let (_reader, samples) = read(participant, reply, reliable(64))?;
+    let request = ("rq/basic_typesRequest", REQUEST);
+    let writer = Arc::new(participant.typed_writer(request, reliable(64))?);
+    // One member of each kind: a request and a reply of test_msgs/srv/BasicTypes end in a string.
+    let mut cdr = BytesMut::new();
+    cdr.put_bytes(0, 48);
+    cdr.put_u32_le(6);
+    cdr.put_slice(b"hello\0");
+    let cdr = cdr.freeze();
+    let (mut waiting, mut answered, mut strangers) = (HashMap::new(), 0_u64, 0_u64);
+    for number in 0..count {
+        let sent = write(&writer, &cdr, None).ok_or("no server takes it")?;
+        waiting.insert(sent, number);
+        while let Ok(sample) = samples.recv_timeout(Duration::from_secs(3)) {
+            let related = sample.related_sample_identity();
+            let ours = related.filter(|it| it.writer_guid.to_bytes() == writer.id());
+            match ours.and_then(|it| waiting.remove(&i64::from(it.sequence_number))) {
+                Some(_) => answered += 1,
+                None => strangers += 1,
+            }
+            if waiting.is_empty() {
+                break;
+            }
+        }
+    }
+    println!("{answered} of {count} answered, {strangers} replies to others");
+    Ok(())
+}
+
+fn watch(participant: &Participant, time: Duration) -> Result<(), Error> {
+    let (sender, found) = sync_channel(64);
+    let _watch = participant.watch_endpoints("r", Box::new(move |it| drop(sender.send(it))))?;
+    let (_reader, _samples) = read(participant, ("rt/marked", COUNTER), reliable(1))?;
+    let _writer = participant.typed_writer(("rt/marked", COUNTER), reliable(1))?;
+    let until = Instant::now() + time;
+    let mut all = [HashMap::new(), HashMap::new()];
+    while let Ok(endpoints) = found.recv_timeout(until.saturating_duration_since(Instant::now())) {
+        for (all, found) in all.iter_mut().zip([endpoints.writers, endpoints.readers]) {
+            all.extend(found.into_iter().map(|it| (it.id, it)));
+        }
+    }
+    for (kind, all) in ["writer", "reader"].into_iter().zip(all) {
+        for it in all.into_values() {
+            let says = String::from_utf8_lossy(&it.user_data).into_owned();
+            println!(
+                "{kind} {} {} reliable={} durable={} marked={} deadline={:?} liveliness={:?} \
+                 sockets={:?} user_data={says:?}",
+                it.topic,
+                it.type_name,
+                it.is_reliable(),
+                it.is_durable(),
+                it.is_marked(),
+                it.qos.deadline(),
+                it.qos.liveliness(),
+                it.sockets,
+            );
+        }
+    }
+    Ok(())
+}
