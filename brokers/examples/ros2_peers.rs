@@ -17,9 +17,9 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Writer, Written,
+    Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer, Written,
 };
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::{BufMut, BytesMut};
 use rustdds::WriteOptionsBuilder;
 use rustdds::rpc::SampleIdentity;
 
@@ -55,7 +55,8 @@ fn main() -> Result<(), Error> {
 }
 
 fn reliable(depth: u16) -> Profile {
-    Profile { reliable: true, window: 64, marked: true, ..Profile::best_effort(depth) }
+    let terms = Terms { marked: true, ..Terms::default() };
+    Profile { reliable: true, window: 64, terms, ..Profile::best_effort(depth) }
 }
 
 /// A reader whose samples come out of a queue.
@@ -65,11 +66,11 @@ fn read(
     profile: Profile,
 ) -> Result<(Reader, Receiver<Sample>), DdsError> {
     let (sender, receiver): (SyncSender<Sample>, _) = sync_channel(4096);
-    let sink = Box::new(move |sample| drop(sender.send(sample)));
+    let sink = Box::new(move |sample| sender.send(sample).is_ok());
     Ok((participant.typed_reader(topic, profile, sink)?, receiver))
 }
 
-fn write(writer: &Writer, cdr: &Bytes, related: Option<SampleIdentity>) -> Option<i64> {
+fn write(writer: &Writer, cdr: &Cdr, related: Option<SampleIdentity>) -> Option<i64> {
     let until = Instant::now() + Duration::from_secs(2);
     while Instant::now() < until {
         let options = WriteOptionsBuilder::new().related_sample_identity_opt(related);
@@ -118,8 +119,8 @@ fn echo(participant: &Participant, time: Duration) -> Result<(), Error> {
     let until = Instant::now() + time;
     while let Ok(sample) = samples.recv_timeout(until.saturating_duration_since(Instant::now())) {
         numbers.note(sample.sequence_number.into());
-        bytes += sample.sample.bytes.len();
-        if write(&writer, &sample.sample.bytes, None).is_none() {
+        bytes += sample.sample.payload().len();
+        if write(&writer, &sample.sample, None).is_none() {
             unsent += 1;
         }
     }
@@ -158,7 +159,7 @@ fn serve(participant: &Participant, time: Duration) -> Result<(), Error> {
             writer_guid: reader.unwrap_or(sample.writer_guid),
             sequence_number: sample.sequence_number,
         };
-        if write(&writer, &sample.sample.bytes, Some(identity)).is_some() {
+        if write(&writer, &sample.sample, Some(identity)).is_some() {
             served += 1;
         }
     }
@@ -172,11 +173,11 @@ fn call(participant: &Participant, count: u64) -> Result<(), Error> {
     let request = ("rq/basic_typesRequest", REQUEST);
     let writer = Arc::new(participant.typed_writer(request, reliable(64))?);
     // One member of each kind: a request and a reply of test_msgs/srv/BasicTypes end in a string.
-    let mut cdr = BytesMut::new();
+    let mut cdr = BytesMut::from(&[0, 1, 0, 0][..]);
     cdr.put_bytes(0, 48);
     cdr.put_u32_le(6);
     cdr.put_slice(b"hello\0");
-    let cdr = cdr.freeze();
+    let cdr = Cdr::little(cdr.freeze()).ok_or("no CDR")?;
     let (mut waiting, mut answered, mut strangers) = (HashMap::new(), 0_u64, 0_u64);
     for number in 0..count {
         let sent = write(&writer, &cdr, None).ok_or("no server takes it")?;

@@ -11,6 +11,7 @@
 //! Nothing here blocks a caller on the network, and a panic inside RustDDS never leaves this
 //! module: it marks the participant as failed, and the owner builds a new one.
 
+pub(crate) mod adapter;
 mod announcement;
 mod farewell;
 #[cfg(feature = "fault-injection")]
@@ -35,7 +36,7 @@ use blaze_domain::node_file::MAX_DDS_DOMAIN;
 
 #[cfg(feature = "fault-injection")]
 pub use fault::Fault;
-pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile};
+pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, Terms};
 pub use pulse::{Illness, Pulse};
 pub use reader::{OctetsSink, Reader, Sample, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};

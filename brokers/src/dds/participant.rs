@@ -128,27 +128,26 @@ pub struct Profile {
     /// not by others; at least `depth`. RustDDS keeps them, and those of the last six seconds, in
     /// memory.
     pub window: u16,
+    /// What is rarely said.
+    pub terms: Terms,
+}
+
+/// The rarer terms of a writer or reader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct Terms {
+    /// Whether it is marked as an endpoint of a flow, for other flows.
+    pub marked: bool,
     /// A writer offers a sample at least this often; a reader asks for that.
     pub deadline: Option<time::Duration>,
     /// A writer tells this often that it lives, by itself; a reader asks for that.
     pub lease: Option<time::Duration>,
-    /// Whether it is marked as an endpoint of a flow, for other flows.
-    pub marked: bool,
 }
 
 impl Profile {
     /// Best effort with room for `depth` samples.
     #[must_use]
     pub fn best_effort(depth: u16) -> Self {
-        Self {
-            reliable: false,
-            depth,
-            transient_local: false,
-            window: 0,
-            deadline: None,
-            lease: None,
-            marked: false,
-        }
+        Self { reliable: false, depth, transient_local: false, window: 0, terms: Terms::default() }
     }
 
     fn qos(self) -> QosPolicies {
@@ -164,14 +163,14 @@ impl Profile {
                 max_instances: 1,
                 max_samples_per_instance: samples,
             });
-        if let Some(deadline) = self.deadline {
+        if let Some(deadline) = self.terms.deadline {
             builder = builder.deadline(Deadline(Duration::from_std(deadline)));
         }
-        if let Some(lease) = self.lease {
+        if let Some(lease) = self.terms.lease {
             let lease_duration = Duration::from_std(lease);
             builder = builder.liveliness(Liveliness::Automatic { lease_duration });
         }
-        if self.marked {
+        if self.terms.marked {
             builder = builder.lifespan(Lifespan { duration: mark() });
         }
         if self.reliable {

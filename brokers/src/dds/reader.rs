@@ -2,7 +2,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -16,19 +16,22 @@ use crate::wake::unpark_waker;
 /// A sample, and what its writer says of it.
 pub type Sample = rustdds::no_key::DeserializedCacheChange<Cdr>;
 
-/// Takes each sample. It runs in the reader's thread: while it works, at most `depth` samples wait,
-/// then the oldest are lost.
-pub type SampleSink = Box<dyn Fn(Sample) + Send>;
+/// Takes each sample and returns whether it is well-formed. It runs in the reader's thread: while
+/// it works, at most `depth` samples wait, then the oldest are lost.
+pub type SampleSink = Box<dyn Fn(Sample) -> bool + Send>;
 
 /// As [`SampleSink`], of the octets of a sample and the participant that wrote it.
 pub type OctetsSink = Box<dyn Fn(GuidPrefix, Bytes) + Send>;
 
-/// Hands the octets of samples to `sink`. A sample that is no sequence of octets is dropped.
+/// Hands the octets of samples to `sink`. A sample that is no sequence of octets is malformed.
 pub(super) fn of_octets(sink: OctetsSink) -> SampleSink {
     Box::new(move |sample| {
-        if let Some(octets) = sample.sample.octets() {
+        let octets = sample.sample.octets();
+        let is_well_formed = octets.is_some();
+        if let Some(octets) = octets {
             sink(prefix_of(sample.writer_guid), octets);
         }
+        is_well_formed
     })
 }
 
@@ -38,6 +41,7 @@ const LONGEST_SLEEP: Duration = Duration::from_millis(250);
 /// Reads one topic until it is dropped.
 pub struct Reader {
     thread: StoppableThread,
+    malformed: Arc<AtomicU64>,
 }
 
 impl Reader {
@@ -46,18 +50,26 @@ impl Reader {
         sink: SampleSink,
         failed: Arc<AtomicBool>,
     ) -> Result<Self, DdsError> {
+        let malformed = Arc::<AtomicU64>::default();
+        let counter = Arc::clone(&malformed);
         let thread = StoppableThread::start("dds-reader", failed, move |stop| {
             let waker = unpark_waker();
             while !stop.load(Ordering::Relaxed) {
-                drain(&reader, &sink);
+                drain(&reader, &sink, &counter);
                 reader.set_waker(Some(waker.clone()));
                 // What came before the waker was set woke nobody.
-                if !drain(&reader, &sink) {
+                if !drain(&reader, &sink, &counter) {
                     thread::park_timeout(LONGEST_SLEEP);
                 }
             }
         })?;
-        Ok(Self { thread })
+        Ok(Self { thread, malformed })
+    }
+
+    /// Samples that were malformed, and were dropped.
+    #[must_use]
+    pub fn malformed(&self) -> u64 {
+        self.malformed.load(Ordering::Relaxed)
     }
 
     /// Whether its thread still runs.
@@ -68,17 +80,20 @@ impl Reader {
 }
 
 /// Takes what is there. Returns whether there was anything.
-fn drain(reader: &RawReader, sink: &SampleSink) -> bool {
+fn drain(reader: &RawReader, sink: &SampleSink, malformed: &AtomicU64) -> bool {
     let mut any = false;
     reader.drain_read_notifications();
     loop {
-        match reader.try_take_one() {
+        let is_well_formed = match reader.try_take_one() {
             Ok(Some(sample)) => sink(sample),
             Ok(None) => return any,
-            // It cannot be read: its encoding is none of CDR.
-            Err(_) => {}
-        }
+            // Its encoding is none of CDR.
+            Err(_) => false,
+        };
         any = true;
+        if !is_well_formed {
+            malformed.fetch_add(1, Ordering::Relaxed);
+        }
     }
 }
 

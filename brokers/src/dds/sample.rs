@@ -1,4 +1,5 @@
-//! Samples as they are on the wire: CDR without its encapsulation, which RustDDS adds and strips.
+//! Samples as they are on the wire, with their encapsulation: four bytes, of which the first two
+//! tell how the CDR behind them is to be read. It is also what rosbag2 and MCAP store.
 //!
 //! Those of BlazeAIoT's own topics are IDL `sequence<octet>`: a length of four bytes and the octets.
 
@@ -7,47 +8,77 @@ use std::io;
 use bytes::{BufMut, Bytes, BytesMut};
 use rustdds::{RepresentationIdentifier, no_key};
 
-/// Bytes of the length before the octets.
-const LENGTH_BYTES: usize = 4;
+/// Bytes of the encapsulation.
+const ENCAPSULATION: usize = 4;
+/// Encapsulation of little-endian CDR.
+const LITTLE: [u8; ENCAPSULATION] = [0x00, 0x01, 0x00, 0x00];
+/// Bytes of the length before octets.
+const LENGTH: usize = 4;
 
 /// One sample.
 #[derive(Debug, Clone)]
-pub struct Cdr {
-    /// How its bytes are to be read.
-    pub encoding: RepresentationIdentifier,
-    /// The serialized data, with up to three bytes of padding at the end.
-    pub bytes: Bytes,
-}
+pub struct Cdr(Bytes);
 
 impl Cdr {
-    /// A sample in little-endian CDR.
-    pub(super) fn little(bytes: Bytes) -> Self {
-        Self { encoding: RepresentationIdentifier::CDR_LE, bytes }
+    /// A sample in little-endian CDR, as [`octet_sequence`] makes it; `None` where it is none.
+    #[must_use]
+    pub fn little(payload: Bytes) -> Option<Self> {
+        (payload.get(..2)? == &LITTLE[..2] && payload.len() >= ENCAPSULATION)
+            .then_some(Self(payload))
+    }
+
+    /// The sample with its encapsulation.
+    #[must_use]
+    pub fn payload(&self) -> &Bytes {
+        &self.0
+    }
+
+    /// How its body is to be read.
+    #[must_use]
+    pub fn encoding(&self) -> [u8; 2] {
+        self.0.first_chunk::<2>().copied().unwrap_or_default()
+    }
+
+    /// The data, with up to three bytes of padding at the end.
+    #[must_use]
+    pub fn body(&self) -> &[u8] {
+        self.0.get(ENCAPSULATION..).unwrap_or_default()
+    }
+
+    /// Whether the body is plain CDR, and if so, whether it is big-endian.
+    pub(crate) fn is_big_endian(&self) -> Option<bool> {
+        match self.encoding() {
+            [0x00, 0x00] => Some(true),
+            [0x00, 0x01] => Some(false),
+            _ => None,
+        }
     }
 
     /// The octets of a `sequence<octet>`; `None` where it is none.
     pub(super) fn octets(&self) -> Option<Bytes> {
-        let length = *self.bytes.first_chunk::<LENGTH_BYTES>()?;
-        let length = match self.encoding {
-            RepresentationIdentifier::CDR_LE => u32::from_le_bytes(length),
-            RepresentationIdentifier::CDR_BE => u32::from_be_bytes(length),
-            _ => return None,
+        let length = *self.body().first_chunk::<LENGTH>()?;
+        let length = if self.is_big_endian()? {
+            u32::from_be_bytes(length)
+        } else {
+            u32::from_le_bytes(length)
         };
-        let end = LENGTH_BYTES.checked_add(usize::try_from(length).ok()?)?;
-        (end <= self.bytes.len()).then(|| self.bytes.slice(LENGTH_BYTES..end))
+        let begin = ENCAPSULATION + LENGTH;
+        let end = begin.checked_add(usize::try_from(length).ok()?)?;
+        (end <= self.0.len()).then(|| self.0.slice(begin..end))
     }
 }
 
-/// Little-endian CDR of a `sequence<octet>` that is made of these parts.
+/// A sample of a `sequence<octet>` that is made of these parts.
 ///
 /// # Errors
 /// Where they have 4 GiB or more together.
-pub fn octet_sequence(parts: &[&[u8]]) -> io::Result<Bytes> {
+pub fn octet_sequence(parts: &[&[u8]]) -> io::Result<Cdr> {
     let length = parts.iter().map(|part| part.len()).sum::<usize>();
-    let mut bytes = BytesMut::with_capacity(LENGTH_BYTES + length);
+    let mut bytes = BytesMut::with_capacity(ENCAPSULATION + LENGTH + length);
+    bytes.put_slice(&LITTLE);
     bytes.put_u32_le(u32::try_from(length).map_err(io::Error::other)?);
     parts.iter().for_each(|part| bytes.put_slice(part));
-    Ok(bytes.freeze())
+    Ok(Cdr(bytes.freeze()))
 }
 
 /// Takes samples of any encoding from RustDDS, and gives it those in little-endian CDR.
@@ -70,10 +101,14 @@ static ENCODINGS: [RepresentationIdentifier; 8] = [
 
 impl no_key::Decode<'_, Cdr> for CdrDecoder {
     type Error = io::Error;
-    fn decode_bytes(self, bytes: &[u8], encoding: RepresentationIdentifier) -> io::Result<Cdr> {
+    fn decode_bytes(self, body: &[u8], encoding: RepresentationIdentifier) -> io::Result<Cdr> {
         // A copy of its own: the slice lies in a receive buffer of 256 KiB, which a small message
-        // would hold.
-        Ok(Cdr { encoding, bytes: Bytes::copy_from_slice(bytes) })
+        // would hold. RustDDS has dropped the options, which hold the length of the padding.
+        let mut bytes = BytesMut::with_capacity(ENCAPSULATION + body.len());
+        bytes.put_slice(&encoding.to_bytes());
+        bytes.put_slice(&LITTLE[2..]);
+        bytes.put_slice(body);
+        Ok(Cdr(bytes.freeze()))
     }
 }
 
@@ -99,7 +134,7 @@ impl no_key::SerializerAdapter<Cdr> for CdrAdapter {
         RepresentationIdentifier::CDR_LE
     }
     fn to_bytes(sample: &Cdr) -> io::Result<Bytes> {
-        Ok(sample.bytes.clone())
+        Ok(sample.0.slice(ENCAPSULATION..))
     }
 }
 
@@ -107,24 +142,34 @@ impl no_key::SerializerAdapter<Cdr> for CdrAdapter {
 mod tests {
     use super::*;
 
+    fn of(payload: &[u8]) -> Cdr {
+        Cdr(Bytes::copy_from_slice(payload))
+    }
+
     #[test]
     fn octets_survive_and_padding_is_ignored() {
         let sample = octet_sequence(&[b"abc", b"de"]).unwrap();
-        assert_eq!(&sample[..], b"\x05\0\0\0abcde");
-        let mut padded = sample.to_vec();
-        padded.extend_from_slice(&[0; 3]);
-        assert_eq!(&Cdr::little(padded.into()).octets().unwrap()[..], b"abcde");
-        let big = Bytes::from_static(b"\0\0\0\x01z");
-        let encoding = RepresentationIdentifier::CDR_BE;
-        assert_eq!(&Cdr { encoding, bytes: big.clone() }.octets().unwrap()[..], b"z");
-        let encoding = RepresentationIdentifier::XCDR2_BE;
-        assert!(Cdr { encoding, bytes: big }.octets().is_none());
+        assert_eq!(&sample.payload()[..], b"\0\x01\0\0\x05\0\0\0abcde");
+        let padded = of(&[sample.payload(), &[0; 3][..]].concat());
+        assert_eq!(&padded.octets().unwrap()[..], b"abcde");
+        assert_eq!(&of(b"\0\0\0\0\0\0\0\x01z").octets().unwrap()[..], b"z");
+        assert!(of(b"\0\x07\0\0\x01\0\0\0z").octets().is_none(), "no plain CDR");
     }
 
     #[test]
     fn a_length_beyond_the_sample_is_refused() {
         for bad in [&b""[..], b"\x01\0\0", b"\x02\0\0\0x", b"\xff\xff\xff\xffx"] {
-            assert!(Cdr::little(Bytes::from_static(bad)).octets().is_none());
+            assert!(of(&[&LITTLE, bad].concat()).octets().is_none());
+        }
+        assert!(of(b"").octets().is_none());
+    }
+
+    #[test]
+    fn only_little_endian_cdr_is_written() {
+        let little = |payload: &'static [u8]| Cdr::little(Bytes::from_static(payload)).is_some();
+        assert!(little(b"\0\x01\0\0") && little(b"\0\x01\0\x03abc\0"));
+        for other in [&b""[..], b"\0\x01\0", b"\0\0\0\0", b"\0\x07\0\0abcd"] {
+            assert!(!little(other), "{other:?}");
         }
     }
 }

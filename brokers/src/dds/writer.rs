@@ -5,7 +5,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use bytes::Bytes;
 use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, RTPSEntity, StatusEvented, WriteOptionsBuilder, no_key};
 
@@ -69,23 +68,22 @@ impl Writer {
     /// Hands octets to RustDDS, as a sample of [`FRAME_TYPE`](super::FRAME_TYPE). Returns whether
     /// they were taken, as [`write_cdr`](Self::write_cdr) tells.
     pub fn write(&self, octets: &[u8]) -> bool {
-        let cdr = octet_sequence(&[octets]);
         let write = |cdr| self.write_cdr(cdr, WriteOptionsBuilder::new());
-        cdr.is_ok_and(|cdr| matches!(write(cdr), Written::Taken(_)))
+        octet_sequence(&[octets]).is_ok_and(|cdr| matches!(write(cdr), Written::Taken(_)))
     }
 
-    /// Hands a sample in little-endian CDR to RustDDS: not without a reader, unless it is kept for
+    /// Hands a sample to RustDDS: not without a reader, unless it is kept for
     /// late joiners, and not into the full window of a reliable writer. Best effort lets the oldest
     /// that still wait give way. `options` travel with the sample.
-    pub fn write_cdr(&self, cdr: Bytes, options: WriteOptionsBuilder) -> Written {
+    pub fn write_cdr(&self, cdr: Cdr, options: WriteOptionsBuilder) -> Written {
         self.contain(|| {
             if !(self.is_matched_now() || self.keeps) {
                 return Some(Written::NoReader);
             }
             // Best effort gives up a sample of which the socket cannot take the rest at once.
-            let waits = cdr.len() > AT_ONCE_BYTES;
+            let waits = cdr.payload().len() > AT_ONCE_BYTES;
             let options = options.best_effort_may_block(waits).build();
-            match self.writer.write_with_options(Cdr::little(cdr), options) {
+            match self.writer.write_with_options(cdr, options) {
                 Ok(sample) => Some(Written::Taken(sample.sequence_number.into())),
                 Err(WriteError::WouldBlock { .. }) => Some(Written::Full),
                 Err(_) => Some(Written::Failed),

@@ -11,7 +11,6 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use blaze_domain::{FlowId, Priority};
-use bytes::Bytes;
 use parking_lot::{Condvar, Mutex};
 
 use super::epochs::Epochs;
@@ -269,7 +268,7 @@ impl InterScope {
     }
 
     /// Sends one datagram while there is a transport; before and after it nothing is sent.
-    pub(super) fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
+    pub(super) fn send(&self, to: &Endpoint, class: Priority, datagram: &[u8]) -> SendOutcome {
         self.current().map_or(SendOutcome::NotSent, |transport| transport.send(to, class, datagram))
     }
 }

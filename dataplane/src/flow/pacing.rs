@@ -119,7 +119,7 @@ impl Egress {
             };
             let Some(transmit) = transmit else { continue };
             let wire_bytes = wire.bytes(transmit.datagram.len());
-            let outcome = inter.send(&transmit.to, transmit.class, transmit.datagram);
+            let outcome = inter.send(&transmit.to, transmit.class, &transmit.datagram);
             let now = Instant::now();
             pacer.spend(wire_bytes, now);
             let mut traffic = self.traffic.lock();

@@ -23,7 +23,6 @@ use std::time::Instant;
 use blaze_brokers::dds::{DdsError, GuidPrefix, Profile, Relay, RelayConfig, Writer};
 use blaze_domain::node_file::Chunking;
 use blaze_domain::{FlowId, Priority};
-use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 
 use super::namesakes::{Life, NameConflict, conflicts};
@@ -222,7 +221,7 @@ impl DdsTransport {
 
     /// Sends one datagram to one endpoint on the topic of a class. Never waits.
     #[must_use]
-    pub fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
+    pub fn send(&self, to: &Endpoint, class: Priority, datagram: &[u8]) -> SendOutcome {
         let fits = datagram.len() <= self.shared.wire.max_datagram_bytes();
         let sent = fits
             && self
@@ -231,7 +230,7 @@ impl DdsTransport {
                 .read()
                 .get(to)
                 .and_then(|writers| writers[class as usize].as_ref())
-                .is_some_and(|writer| writer.write(&datagram));
+                .is_some_and(|writer| writer.write(datagram));
         if sent {
             SendOutcome::Sent
         } else {

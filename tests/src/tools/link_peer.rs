@@ -146,7 +146,7 @@ fn exchange_addresses(transport: &DdsTransport, seen: &Mutex<Seen>) {
     for peer in peers {
         transport.connect(&peer);
         let hello = [HELLO, known.join(",").as_bytes()].concat();
-        let _ = transport.send(&peer, Priority::Control, hello.into());
+        let _ = transport.send(&peer, Priority::Control, &hello);
     }
 }
 
@@ -165,14 +165,14 @@ fn measure(
     std::thread::sleep(Duration::from_secs(1));
     let before = counters(&interface);
     let begin = Instant::now();
-    let datagram = Bytes::from(vec![0xab; size]);
+    let datagram = vec![0xab; size];
     let (mut sent, mut computed) = (0, 0);
     for number in 0..count {
         let due = Duration::from_secs_f64(number as f64 / rate);
         if let Some(wait) = due.checked_sub(begin.elapsed()) {
             std::thread::sleep(wait);
         }
-        if transport.send(to, class, datagram.clone()) == SendOutcome::Sent {
+        if transport.send(to, class, &datagram) == SendOutcome::Sent {
             sent += 1;
             computed += transport.wire_bytes(size) as u64;
         }

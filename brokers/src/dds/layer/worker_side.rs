@@ -9,10 +9,8 @@ use async_trait::async_trait;
 use blaze_domain::names::ChannelName;
 use parking_lot::Mutex;
 
-use super::channel::MAX_CHANNELS;
-use super::send::Target;
-use super::shared::Shared;
-use super::{DdsPublisher, RELIABLE_WAIT, names};
+use super::names;
+use crate::dds::adapter::{Adapter, MAX_CHANNELS, TopicPublisher};
 use crate::port::{BrokerError, PublishOutcome, Publisher as _};
 use crate::worker_side::{KeyedMessage, WorkerSide, WriteError};
 
@@ -21,13 +19,13 @@ const DEPTH: u32 = 64;
 
 /// What the worker is given.
 pub(super) struct DdsWorkerSide {
-    shared: Arc<Shared>,
-    prepared: Mutex<HashMap<ChannelName, Arc<DdsPublisher>>>,
+    adapter: Arc<Adapter>,
+    prepared: Mutex<HashMap<ChannelName, Arc<TopicPublisher>>>,
 }
 
 impl DdsWorkerSide {
-    pub(super) fn new(shared: &Arc<Shared>) -> Self {
-        Self { shared: Arc::clone(shared), prepared: Mutex::default() }
+    pub(super) fn new(adapter: &Arc<Adapter>) -> Self {
+        Self { adapter: Arc::clone(adapter), prepared: Mutex::default() }
     }
 
     fn write_one(&self, message: &KeyedMessage) -> Result<(), WriteError> {
@@ -42,7 +40,7 @@ impl DdsWorkerSide {
         };
         match publisher.publish_bare(value, None) {
             PublishOutcome::Taken => Ok(()),
-            PublishOutcome::Dropped => Err(self.shared.away().into()),
+            PublishOutcome::Dropped => Err(self.adapter.away().into()),
             PublishOutcome::TooLarge => {
                 Err(WriteError::TooLarge { channel: message.channel.clone(), bytes: value.len() })
             }
@@ -60,11 +58,7 @@ impl WorkerSide for DdsWorkerSide {
         if prepared.len() >= MAX_CHANNELS {
             return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
         }
-        let target = Target::keeping(&self.shared, names::topic(channel), DEPTH);
-        let publisher = DdsPublisher {
-            lane: self.shared.outbox.lane(target, Some(RELIABLE_WAIT)),
-            admission: Arc::clone(&self.shared),
-        };
+        let publisher = self.adapter.keeping(names::topic(channel), DEPTH);
         prepared.insert(channel.clone(), Arc::new(publisher));
         Ok(())
     }
@@ -76,9 +70,7 @@ impl WorkerSide for DdsWorkerSide {
     /// RustDDS does not tell which readers have a sample: one counts as written when it waits to be
     /// sent.
     async fn write(&self, messages: &[KeyedMessage]) -> Result<(), WriteError> {
-        if !self.shared.is_up() {
-            return Err(self.shared.away().into());
-        }
+        self.adapter.check_up()?;
         messages.iter().try_for_each(|message| self.write_one(message))
     }
 }

@@ -1,3 +1,4 @@
+use bytes::Bytes;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::Duration;
 
@@ -84,7 +85,7 @@ impl Flow {
         self.transport.connect(to);
         for class in Priority::ALL {
             wait_for("first datagram", Duration::from_secs(5), || {
-                let _ = self.transport.send(to, *class, Bytes::from_static(b"first"));
+                let _ = self.transport.send(to, *class, b"first");
                 other
                     .received(*class)
                     .iter()
@@ -137,10 +138,7 @@ fn two_flows_of_one_host_meet_and_exchange_all_classes_in_order() {
         for number in 0..200_u32 {
             let mut datagram = vec![0; size];
             datagram[..4].copy_from_slice(&number.to_le_bytes());
-            assert_eq!(
-                robot.transport.send(&fog.endpoint, *class, datagram.into()),
-                SendOutcome::Sent
-            );
+            assert_eq!(robot.transport.send(&fog.endpoint, *class, &datagram), SendOutcome::Sent);
         }
         let numbers = wait_for("all datagrams", Duration::from_secs(5), || {
             let received = fog.received(*class);
@@ -153,20 +151,14 @@ fn two_flows_of_one_host_meet_and_exchange_all_classes_in_order() {
         });
         assert_eq!(numbers, (0..200).collect::<Vec<_>>(), "{class}");
     }
-    let too_large = Bytes::from(vec![0; size + 1]);
+    let too_large = vec![0; size + 1];
     assert_eq!(
-        robot.transport.send(&fog.endpoint, Priority::Bulk, too_large),
+        robot.transport.send(&fog.endpoint, Priority::Bulk, &too_large),
         SendOutcome::NotSent
     );
     robot.transport.disconnect(&fog.endpoint, &[Priority::Bulk]);
-    assert_eq!(
-        robot.transport.send(&fog.endpoint, Priority::Bulk, Bytes::new()),
-        SendOutcome::NotSent
-    );
-    assert_eq!(
-        robot.transport.send(&fog.endpoint, Priority::State, Bytes::new()),
-        SendOutcome::Sent
-    );
+    assert_eq!(robot.transport.send(&fog.endpoint, Priority::Bulk, &[]), SendOutcome::NotSent);
+    assert_eq!(robot.transport.send(&fog.endpoint, Priority::State, &[]), SendOutcome::Sent);
 }
 
 #[test]

@@ -4,16 +4,16 @@ use std::collections::HashMap;
 use std::time::Instant;
 
 use rustdds::Timestamp;
-use rustdds::no_key::DeserializedCacheChange;
 
+use super::Decoded;
 use super::channel::Channel;
 use super::kept::History;
 use super::seen::{Moment, Seen};
 use super::shared::{Shared, WriterFacts};
 use crate::dds::EndpointId;
-use crate::dds::sample::Cdr;
+use crate::dds::Sample;
 use crate::dds::writer::endpoint_of;
-use crate::port::{Content, Received};
+use crate::port::Received;
 
 /// Writers of one channel whose progress is remembered; those that are gone are forgotten first.
 const MAX_WRITERS: usize = 4096;
@@ -53,7 +53,7 @@ pub(super) fn deliver(
     channel: &Channel,
     kind: Kind,
     progress: &mut Progress<'_>,
-    sample: &DeserializedCacheChange<Cdr>,
+    sample: &Sample,
 ) {
     let writer = endpoint_of(sample.writer_guid());
     let facts = shared.writers.read().get(&writer).copied();
@@ -82,12 +82,15 @@ pub(super) fn deliver(
     } else if own || is_old || !since_opened {
         return;
     }
-    let Some(octets) = sample.sample.octets() else {
-        shared.counts.lock().malformed += 1;
-        tracing::debug!(topic = &*channel.topic, "a sample is no sequence of octets");
-        return;
+    let content = match shared.dialect.decode(&channel.topic, sample) {
+        Decoded::Message(content) => content,
+        Decoded::NotForUs => return,
+        Decoded::Malformed => {
+            shared.counts.lock().malformed += 1;
+            tracing::debug!(topic = &*channel.topic.name, "a sample is malformed");
+            return;
+        }
     };
-    let content = Content::of(channel.is_reserved, octets);
     let at = Instant::now();
     let mut received = Received::live(content, at);
     match moment {
@@ -113,7 +116,7 @@ fn moment_of(
     shared: &Shared,
     facts: Option<WriterFacts>,
     writer: EndpointId,
-    sample: &DeserializedCacheChange<Cdr>,
+    sample: &Sample,
 ) -> Option<Moment> {
     let facts = facts.filter(|facts| facts.durable)?;
     Some(Moment {
@@ -125,7 +128,7 @@ fn moment_of(
 }
 
 /// Nanoseconds since 1970.
-pub(super) fn nanos(time: Timestamp) -> i128 {
+pub(crate) fn nanos(time: Timestamp) -> i128 {
     (i128::from(time.to_ticks()) * 1_000_000_000) >> 32
 }
 

@@ -10,11 +10,11 @@ use std::time::Duration;
 
 use parking_lot::{Mutex, RwLock};
 
-use super::DdsCounts;
 use super::channel::Channels;
 use super::presence::{Clock, Clocks};
 use super::send::Target;
 use super::slot::Slots;
+use super::{DdsCounts, Dialect};
 use crate::dds::EndpointId;
 use crate::dds::writer::participant_of;
 use crate::outbox::{Outbox, OutboxLimits};
@@ -43,7 +43,8 @@ pub(super) struct WriterFacts {
     pub(super) signs: bool,
 }
 
-pub(super) struct Shared {
+pub(crate) struct Shared {
+    pub(super) dialect: Arc<dyn Dialect>,
     pub(super) domain: u16,
     pub(super) address: Ipv4Addr,
     pub(super) status: StatusCell,
@@ -67,8 +68,9 @@ pub(super) struct Shared {
 }
 
 impl Shared {
-    pub(super) fn new(domain: u16, address: Ipv4Addr) -> Arc<Self> {
+    pub(super) fn new(dialect: Arc<dyn Dialect>, domain: u16, address: Ipv4Addr) -> Arc<Self> {
         Arc::new(Self {
+            dialect,
             domain,
             address,
             status: StatusCell::new(Health::Connecting, String::new()),

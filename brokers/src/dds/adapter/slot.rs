@@ -5,11 +5,10 @@ use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-use blaze_domain::WriterId;
-use bytes::Bytes;
+use blaze_domain::{DropReason, WriterId};
 use parking_lot::Mutex;
-use rustdds::{Timestamp, WriteOptionsBuilder};
 
+use super::{Encoded, Topic};
 use crate::dds::{Profile, Writer, Written};
 
 /// How long a new writer waits for its first reader: discovery takes that long where there is one.
@@ -34,7 +33,7 @@ const LARGE_WINDOW: u16 = 64;
 /// Which writer.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct SlotKey {
-    pub(super) topic: Arc<str>,
+    pub(super) topic: Topic,
     pub(super) reliable: bool,
     pub(super) large: bool,
     /// Samples for late joiners; 0 = volatile.
@@ -53,7 +52,7 @@ impl SlotKey {
             depth: if self.depth > 0 { self.depth } else { depth },
             transient_local: self.depth > 0,
             window: if self.reliable { window } else { 0 },
-            ..Profile::best_effort(depth)
+            terms: self.topic.terms,
         }
     }
 }
@@ -65,8 +64,8 @@ pub(super) enum Attempt {
     Done,
     /// Try again in a moment.
     NotNow,
-    /// RustDDS refused.
-    Failed,
+    /// It is dropped.
+    Dropped(DropReason),
 }
 
 #[derive(Default)]
@@ -99,7 +98,11 @@ impl Drop for Slot {
 
 impl Slot {
     /// Writes a sample, if its writer is there and can take it.
-    pub(super) fn write(&self, now: Instant, cdr: impl FnOnce() -> Bytes) -> Attempt {
+    pub(super) fn write(
+        &self,
+        now: Instant,
+        encode: impl FnOnce() -> Result<Encoded, DropReason>,
+    ) -> Attempt {
         let mut state = self.state.lock();
         let state = &mut *state;
         let Some(writer) = &state.writer else {
@@ -117,11 +120,11 @@ impl Slot {
             }
             state.settled = true;
         }
-        let mut options = WriteOptionsBuilder::new();
-        if self.key.depth > 0 {
-            options = options.source_timestamp(Timestamp::now());
-        }
-        match writer.write_cdr(cdr(), options) {
+        let encoded = match encode() {
+            Ok(encoded) => encoded,
+            Err(reason) => return Attempt::Dropped(reason),
+        };
+        match writer.write_cdr(encoded.cdr, encoded.options) {
             Written::Taken(_) | Written::NoReader => {
                 state.full_since = None;
                 Attempt::Done
@@ -130,7 +133,7 @@ impl Slot {
                 state.full_since.get_or_insert(now);
                 Attempt::NotNow
             }
-            Written::Failed => Attempt::Failed,
+            Written::Failed => Attempt::Dropped(DropReason::BrokerError),
         }
     }
 

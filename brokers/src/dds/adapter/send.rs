@@ -7,18 +7,16 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, WriterId};
-use bytes::Bytes;
 use lru::LruCache;
 use parking_lot::Mutex;
 
-use super::names;
+use super::Topic;
 use super::shared::Shared;
 use super::slot::{Attempt, Slot, SlotKey};
 use crate::dds::DdsError;
 use crate::dds::reader::StoppableThread;
-use crate::dds::sample::octet_sequence;
 use crate::outbox::{Body, Fate, Waiting};
-use crate::port::{Content, PublisherOptions};
+use crate::port::PublisherOptions;
 use crate::wake::wait;
 
 /// Messages and bytes of one turn; one message always fits.
@@ -44,7 +42,7 @@ const MAX_ORIGINS: usize = 256;
 const MAX_DEPTH: u32 = 1024;
 
 /// Where a publisher's messages go.
-pub(super) struct Target {
+pub(crate) struct Target {
     id: u64,
     key: SlotKey,
     /// The writer of all origins; none where each has its own.
@@ -53,7 +51,7 @@ pub(super) struct Target {
 }
 
 impl Target {
-    pub(super) fn new(shared: &Arc<Shared>, topic: Arc<str>, options: PublisherOptions) -> Self {
+    pub(super) fn new(shared: &Arc<Shared>, topic: Topic, options: PublisherOptions) -> Self {
         let depth = depth_of(options.depth);
         let key = SlotKey {
             topic,
@@ -72,7 +70,7 @@ impl Target {
 
     /// One writer for all that is published, which keeps the last `depth` for late joiners, whoever
     /// wrote them.
-    pub(super) fn keeping(shared: &Arc<Shared>, topic: Arc<str>, depth: u32) -> Self {
+    pub(super) fn keeping(shared: &Arc<Shared>, topic: Topic, depth: u32) -> Self {
         let key =
             SlotKey { topic, reliable: true, large: false, depth: depth_of(depth), origin: None };
         Self::with_writer(shared, key)
@@ -236,34 +234,23 @@ fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<F
         return Some(Fate::Dropped(reason));
     }
     let slot = waiting.to.slot_of(shared, &waiting.body);
-    match slot.write(now, || cdr(waiting, now)) {
+    let topic = &slot.key.topic;
+    let durable = slot.key.depth > 0;
+    let body = aged(waiting, now);
+    match slot.write(now, || shared.dialect.encode(topic, &body, durable)) {
         Attempt::Done => {
-            let is_reserved = !slot.key.topic.starts_with(names::USER_PREFIX);
-            shared.channels.deliver_own(&slot.key.topic, || content(waiting, now, is_reserved));
+            shared.channels.deliver_own(&topic.name, || shared.dialect.own(topic, &body));
             Some(Fate::Delivered)
         }
-        Attempt::Failed => Some(Fate::Dropped(DropReason::BrokerError)),
+        Attempt::Dropped(reason) => Some(Fate::Dropped(reason)),
         Attempt::NotNow => None,
     }
 }
 
-/// The message as own readers receive it.
-fn content(waiting: &Waiting<Target>, now: Instant, is_reserved: bool) -> Content {
+/// The message with the age that it has when it is written.
+fn aged(waiting: &Waiting<Target>, now: Instant) -> Body {
     match &waiting.body {
-        Body::Frame(frame) => Content::Frame(Waiting::<Target>::aged(frame, waiting.since, now)),
-        Body::Bare(payload) => Content::of(is_reserved, payload.clone()),
+        Body::Frame(frame) => Body::Frame(Waiting::<Target>::aged(frame, waiting.since, now)),
+        Body::Bare(payload) => Body::Bare(payload.clone()),
     }
-}
-
-/// The message as one sample.
-fn cdr(waiting: &Waiting<Target>, now: Instant) -> Bytes {
-    let sequence = match &waiting.body {
-        Body::Bare(payload) => octet_sequence(&[payload]),
-        Body::Frame(frame) => {
-            let frame = Waiting::<Target>::aged(frame, waiting.since, now);
-            octet_sequence(&[&frame.head_to_write(), frame.payload()])
-        }
-    };
-    // Nothing in the queue is near the 4 GiB of which a sequence can tell the length.
-    sequence.unwrap_or_default()
 }

@@ -7,14 +7,13 @@ use std::task::{Wake, Waker};
 use std::thread::{self, Thread};
 use std::time::{Duration, Instant};
 
-use blaze_domain::names::ChannelName;
 use parking_lot::{Mutex, RwLock};
 use rustdds::Timestamp;
 use tokio::sync::oneshot;
 
+use super::Topic;
 use super::deliver::{Kind, Progress, deliver};
 use super::kept::History;
-use super::names;
 use super::seen::Seen;
 use super::shared::Shared;
 use crate::dds::participant::RawReader;
@@ -23,7 +22,7 @@ use crate::dds::{DdsError, EndpointId, Profile};
 use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
 
 /// Channels that one broker reads at most.
-pub(super) const MAX_CHANNELS: usize = 4096;
+pub(crate) const MAX_CHANNELS: usize = 4096;
 /// Samples that one channel gives before the next has its turn.
 const TURN: usize = 256;
 /// A safety net only: RustDDS wakes the thread.
@@ -48,8 +47,7 @@ pub(super) struct Readers {
 
 /// A channel that is read.
 pub(super) struct Channel {
-    pub(super) topic: Arc<str>,
-    pub(super) is_reserved: bool,
+    pub(super) topic: Topic,
     pub(super) large: bool,
     /// Begin with what is kept for late joiners.
     pub(super) with_kept: bool,
@@ -76,6 +74,7 @@ impl Channel {
         Profile {
             reliable,
             transient_local: self.with_kept && reliable,
+            terms: self.topic.terms,
             ..Profile::best_effort(depth)
         }
     }
@@ -182,7 +181,7 @@ impl Channel {
                 Ok(None) => return false,
                 Err(error) => {
                     shared.counts.lock().malformed += 1;
-                    tracing::debug!(topic = &*self.topic, %error, "a sample cannot be read");
+                    tracing::debug!(topic = &*self.topic.name, %error, "a sample cannot be read");
                 }
             }
         }
@@ -203,7 +202,7 @@ impl Wake for Bell {
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct ChannelKey {
-    topic: Arc<str>,
+    topic: Topic,
     large: bool,
     /// One that begins with what is kept shares its reader with nobody.
     alone: Option<u64>,
@@ -224,13 +223,13 @@ impl Channels {
     /// Adds a reader; it hears of it when the channel is read.
     pub(super) fn add(
         &self,
-        channel: &ChannelName,
+        topic: Topic,
         sender: SubscriptionSender,
         options: SubscribeOptions,
     ) -> Result<oneshot::Receiver<()>, BrokerError> {
         let (confirm, confirmed) = oneshot::channel();
         let key = ChannelKey {
-            topic: names::topic(channel),
+            topic,
             large: options.large,
             alone: options.with_kept.then(|| self.next.fetch_add(1, Ordering::Relaxed)),
         };
@@ -244,8 +243,7 @@ impl Channels {
         let found = all.entry(key).or_insert_with_key(|key| {
             let ready = Arc::clone(&self.ready[usize::from(options.large)]);
             let made = Arc::new_cyclic(|weak| Channel {
-                topic: Arc::clone(&key.topic),
-                is_reserved: channel.is_reserved(),
+                topic: key.topic.clone(),
                 large: options.large,
                 with_kept: options.with_kept,
                 senders: Mutex::default(),
@@ -256,7 +254,7 @@ impl Channels {
                 weak: weak.clone(),
             });
             let mut by_topic = self.by_topic.write();
-            by_topic.entry(Arc::clone(&key.topic)).or_default().push(Arc::clone(&made));
+            by_topic.entry(Arc::clone(&key.topic.name)).or_default().push(Arc::clone(&made));
             made
         });
         // In this order, as the thread that opens it locks them.
@@ -287,10 +285,10 @@ impl Channels {
         });
         let mut by_topic = self.by_topic.write();
         for gone in &unused {
-            if let Some(channels) = by_topic.get_mut(&gone.topic) {
+            if let Some(channels) = by_topic.get_mut(&gone.topic.name) {
                 channels.retain(|channel| !Arc::ptr_eq(channel, gone));
                 if channels.is_empty() {
-                    by_topic.remove(&gone.topic);
+                    by_topic.remove(&gone.topic.name);
                 }
             }
         }
@@ -299,10 +297,11 @@ impl Channels {
     }
 
     /// Hands an own message to the own readers of its topic. `content` is asked for once for each.
-    pub(super) fn deliver_own(&self, topic: &str, content: impl Fn() -> Content) {
+    pub(super) fn deliver_own(&self, topic: &str, content: impl Fn() -> Option<Content>) {
         let by_topic = self.by_topic.read();
         for channel in by_topic.get(topic).into_iter().flatten() {
-            channel.send(Received::live(content(), Instant::now()));
+            let Some(content) = content() else { return };
+            channel.send(Received::live(content, Instant::now()));
         }
     }
 

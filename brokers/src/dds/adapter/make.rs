@@ -5,64 +5,46 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_domain::MAX_PAYLOAD_BYTES;
+use parking_lot::{Mutex, RwLock};
 use rustdds::Timestamp;
-use serde_json::{Value, json};
 
+use super::Companion;
 use super::channel::Channel;
-use super::deliver::nanos;
-use super::names::ALIVE;
 use super::near::Near;
-use super::presence::Presence;
+use super::presence::{Clocks, Presence};
 use super::probe::Probe;
 use super::shared::{Shared, WriterFacts};
 use super::slot::Slot;
 use crate::dds::farewell::Farewell;
-use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
-    DdsError, EndpointWatch, Endpoints, FRAME_TYPE, FoundEndpoint, GuidPrefix, Illness,
-    Participant, ParticipantConfig, Profile, Pulse, Writer, create_error,
+    DdsError, EndpointWatch, Endpoints, FoundEndpoint, GuidPrefix, Illness, Participant, Pulse,
+    create_error,
 };
 
-/// Between two signs of life.
-const SIGN: Duration = Duration::from_millis(500);
 /// Between two questions to the hosts of other participants.
 const PROBE: Duration = Duration::from_millis(100);
-/// Bytes of the largest sample: the largest payload with the largest header.
-const LARGEST_SAMPLE: usize = MAX_PAYLOAD_BYTES + 8 * 1024;
-/// Room for what RustDDS sends at once; the system caps it (`net.core.wmem_max`).
-const SEND_BUFFER: usize = 8 * 1024 * 1024;
-/// Signs of life that wait to be read.
-const SIGNS: u16 = 256;
 
 /// Fields drop in this order: users first, the participant last.
 pub(super) struct Generation {
     watch: EndpointWatch,
     pulse: Pulse,
-    signs: RawReader,
-    sign: Writer,
-    next_sign: Instant,
+    companion: Box<dyn Companion>,
     probes: HashMap<GuidPrefix, (SocketAddr, Probe)>,
     next_probe: Instant,
     farewell: Farewell,
-    pub(super) presence: Arc<parking_lot::Mutex<Presence>>,
+    pub(super) presence: Arc<Mutex<Presence>>,
     pub(super) participant: Participant,
 }
 
 impl Generation {
     pub(super) fn start(shared: &Arc<Shared>, now: Instant) -> Result<Self, DdsError> {
-        let participant = Participant::start(ParticipantConfig {
-            send_buffer_bytes: SEND_BUFFER,
-            largest_sample: u32::try_from(LARGEST_SAMPLE).unwrap_or(u32::MAX),
-            repairs_fragments: true,
-            ..ParticipantConfig::new(shared.domain, shared.address)
-        })?;
+        let config = shared.dialect.participant(shared.domain, shared.address);
+        let participant = Participant::start(config)?;
         let pulse = Pulse::start(&participant)?;
-        let profile = Profile::best_effort(SIGNS);
         let farewell =
             Farewell::new(shared.address, participant.port()).map_err(create_error("socket"))?;
         let near = Near::of_interface(shared.address);
-        let presence = Arc::new(parking_lot::Mutex::new(Presence::new(near)));
+        let presence = Arc::new(Mutex::new(Presence::new(near)));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
             watch: participant.watch_endpoints(
@@ -72,9 +54,7 @@ impl Generation {
                 }),
             )?,
             pulse,
-            signs: participant.raw_reader((ALIVE, FRAME_TYPE), profile)?,
-            sign: participant.writer(ALIVE, profile)?,
-            next_sign: now,
+            companion: shared.dialect.companion(&participant, now)?,
             probes: HashMap::new(),
             next_probe: now,
             farewell,
@@ -96,7 +76,8 @@ impl Generation {
     /// Makes a writer.
     pub(super) fn fill(&self, shared: &Shared, slot: &Slot, now: Instant) -> Result<(), DdsError> {
         let profile = slot.key.profile();
-        let writer = self.participant.writer(&slot.key.topic, profile)?;
+        let topic = &slot.key.topic;
+        let writer = self.participant.typed_writer((&topic.name, &topic.type_name), profile)?;
         let facts = WriterFacts {
             reliable: profile.reliable,
             durable: profile.transient_local,
@@ -110,7 +91,7 @@ impl Generation {
 
     /// Makes the readers of a channel that are missing.
     pub(super) fn open(&self, channel: &Channel, best_effort: bool) -> Result<(), DdsError> {
-        let topic = (&*channel.topic, FRAME_TYPE);
+        let topic = (&*channel.topic.name, &*channel.topic.type_name);
         let mut readers = channel.readers.lock();
         let is_new = readers.reliable.is_none();
         if is_new {
@@ -128,39 +109,11 @@ impl Generation {
         Ok(())
     }
 
-    /// Tells others that this one lives and reads who else does. Returns whether another one has
-    /// given this one up.
-    pub(super) fn exchange_signs(&mut self, shared: &Shared, now: Instant) -> bool {
-        if now >= self.next_sign {
-            self.next_sign = now + SIGN;
-            let gone: Vec<String> =
-                self.presence.lock().gone(now).map(|prefix| prefix.to_string()).collect();
-            let time_ns = u64::try_from(nanos(Timestamp::now())).unwrap_or(0);
-            let sign = json!({ "time_ns": time_ns, "gone": gone });
-            self.sign.write(sign.to_string().as_bytes());
-        }
-        let own = self.participant.prefix();
-        let mut given_up = false;
-        self.signs.drain_read_notifications();
-        for _ in 0..SIGNS {
-            let Ok(taken) = self.signs.try_take_one() else { continue };
-            let Some(sample) = taken else { break };
-            let from = prefix_of(sample.writer_guid());
-            let received = nanos(sample.receive_instant);
-            let octets = sample.sample.octets().unwrap_or_default();
-            let Ok(sign) = serde_json::from_slice::<Value>(&octets) else { continue };
-            if from == own {
-                continue;
-            }
-            self.presence.lock().sign(now, from);
-            if let Some(sent) = sign["time_ns"].as_u64() {
-                shared.clocks.write().compare(now, from, i128::from(sent), received);
-            }
-            let name = own.to_string();
-            let mut gone = sign["gone"].as_array().into_iter().flatten();
-            given_up |= gone.any(|prefix| prefix.as_str() == Some(&name));
-        }
-        given_up
+    /// What belongs to this life has its turn. Returns whether another participant has given this
+    /// one up.
+    pub(super) fn tick(&mut self, shared: &Shared, now: Instant) -> bool {
+        let others = Others { presence: &self.presence, clocks: &shared.clocks };
+        self.companion.tick(now, self.participant.prefix(), &others)
     }
 
     /// Says good-bye for those that are gone without having said so.
@@ -208,10 +161,13 @@ impl Generation {
 }
 
 /// Takes over what other participants have.
-fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endpoints: &Endpoints) {
+fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
     let mut best_effort = HashSet::new();
-    let sign = |writer: &FoundEndpoint| (writer.topic == ALIVE).then(|| writer.participant());
+    shared.dialect.note_endpoints(endpoints);
+    let signs = shared.dialect.sign_topic();
+    let sign =
+        |writer: &FoundEndpoint| (Some(&*writer.topic) == signs).then(|| writer.participant());
     let alive: HashSet<GuidPrefix> = endpoints.writers.iter().filter_map(sign).collect();
     {
         let mut writers = shared.writers.write();
@@ -233,5 +189,28 @@ fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endp
     if changed {
         *shared.best_effort.write() = best_effort;
         shared.wake_lifecycle();
+    }
+}
+
+/// What a companion knows of other participants, and tells of them.
+pub(crate) struct Others<'a> {
+    presence: &'a Mutex<Presence>,
+    clocks: &'a RwLock<Clocks>,
+}
+
+impl Others<'_> {
+    /// Those that were given up not long ago.
+    pub(crate) fn gone(&self, now: Instant) -> Vec<String> {
+        self.presence.lock().gone(now).map(|prefix| prefix.to_string()).collect()
+    }
+
+    /// One has told that it lives.
+    pub(crate) fn note_sign(&self, now: Instant, from: GuidPrefix) {
+        self.presence.lock().sign(now, from);
+    }
+
+    /// One has told its time of day; both times in nanoseconds since 1970.
+    pub(crate) fn compare(&self, now: Instant, from: GuidPrefix, sent_ns: i128, received_ns: i128) {
+        self.clocks.write().compare(now, from, sent_ns, received_ns);
     }
 }

@@ -96,7 +96,7 @@ impl Lifecycle {
             generation.presence.lock().excuse(now);
         }
         let age = now.saturating_duration_since(self.built);
-        let given_up = generation.exchange_signs(&self.shared, now) && age > SILENT;
+        let given_up = generation.tick(&self.shared, now) && age > SILENT;
         let reason = if given_up {
             Some("others had given this participant up")
         } else if paused > FORGOTTEN {
@@ -199,7 +199,7 @@ fn full(slots: &[Arc<Slot>], now: Instant) -> Vec<(&str, Instant)> {
     let since = |slot: &Arc<Slot>| {
         slot.full_since().filter(|since| now.saturating_duration_since(*since) >= PRESSURE)
     };
-    let full = slots.iter().filter_map(|slot| Some((&*slot.key.topic, since(slot)?)));
+    let full = slots.iter().filter_map(|slot| Some((&*slot.key.topic.name, since(slot)?)));
     full.collect()
 }
 
@@ -214,7 +214,7 @@ fn make_missing(
         generation.fill(shared, slot, now)?;
     }
     for channel in shared.channels.list() {
-        let best_effort = shared.best_effort.read().contains(&*channel.topic);
+        let best_effort = shared.best_effort.read().contains(&*channel.topic.name);
         generation.open(&channel, best_effort)?;
     }
     Ok(())

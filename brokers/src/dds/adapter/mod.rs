@@ -1,0 +1,284 @@
+//! What adapters on DDS share: topics are written and read by a participant that is built anew when
+//! RustDDS dies. What differs (names, types, what a sample holds) is a [`Dialect`].
+//!
+//! ```text
+//! publisher ─► outbox ─► sender thread ─► Slot (a DDS writer) ─► RustDDS ─► network
+//! network ─► RustDDS ─► reading threads (small, large) ─► Channel (one or two DDS readers) ─► readers' rings
+//! lifecycle thread: participant, writers, readers; presence of others; builds all anew when RustDDS dies
+//! ```
+//!
+//! There is no server: the broker is up while a participant stands on the interface. A participant
+//! that dies without a good-bye would hold the windows of all reliable writers for as long as its
+//! lease; `presence` finds it, and `farewell` says good-bye in its name, to the own participant
+//! only.
+
+mod channel;
+mod deliver;
+mod kept;
+mod life;
+mod make;
+mod near;
+mod presence;
+mod probe;
+mod seen;
+mod send;
+mod shared;
+mod slot;
+
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use blaze_domain::DropReason;
+use parking_lot::Mutex;
+use rustdds::WriteOptionsBuilder;
+use tokio::sync::watch;
+
+use super::participant::Terms;
+use super::reader::StoppableThread;
+use super::{Cdr, DdsError, Endpoints, GuidPrefix, Participant, ParticipantConfig, Sample};
+use crate::outbox::{Admission, Body, LanePublisher};
+use crate::port::{
+    BrokerError, BrokerStatus, Content, PublisherOptions, SubscribeOptions, Subscription,
+};
+use send::Target;
+use shared::Shared;
+
+pub(crate) use channel::MAX_CHANNELS;
+pub(crate) use deliver::nanos;
+pub(crate) use make::Others;
+pub use shared::MAX_QUEUE_BYTES;
+
+/// How long closing delivers what was taken.
+const DRAIN: Duration = Duration::from_secs(1);
+/// How long readers have to take what they have acknowledged, before its writer goes: RustDDS
+/// forgets what was not read of a writer that has gone.
+const LINGER: Duration = Duration::from_millis(150);
+/// How long a message may wait for RustDDS.
+const LONGEST_WAIT: Duration = Duration::from_secs(5);
+/// The same of one that must not be lost.
+const RELIABLE_WAIT: Duration = Duration::from_secs(120);
+/// How long a subscription may take to be made.
+const SUBSCRIBE: Duration = Duration::from_secs(5);
+const LOOK: Duration = Duration::from_millis(5);
+
+/// A DDS topic, as its readers and writers are made.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) struct Topic {
+    pub(crate) name: Arc<str>,
+    pub(crate) type_name: Arc<str>,
+    pub(crate) terms: Terms,
+}
+
+/// A message as RustDDS is given it.
+pub(crate) struct Encoded {
+    pub(crate) cdr: Cdr,
+    pub(crate) options: WriteOptionsBuilder,
+}
+
+/// What a sample is to those who read its topic.
+pub(crate) enum Decoded {
+    Message(Content),
+    /// It is for other readers.
+    #[allow(dead_code, reason = "of the adapter of ROS 2")]
+    NotForUs,
+    Malformed,
+}
+
+/// What one adapter does differently from others.
+pub(crate) trait Dialect: Send + Sync + 'static {
+    /// The participant that it needs.
+    fn participant(&self, domain: u16, address: Ipv4Addr) -> ParticipantConfig;
+
+    /// What a new participant does beside readers and writers of topics.
+    ///
+    /// # Errors
+    /// [`DdsError`] when RustDDS refuses or has died.
+    fn companion(
+        &self,
+        participant: &Participant,
+        now: Instant,
+    ) -> Result<Box<dyn Companion>, DdsError>;
+
+    /// The topic on which participants of this kind tell that they live.
+    fn sign_topic(&self) -> Option<&'static str> {
+        None
+    }
+
+    /// All readers and writers that others have.
+    fn note_endpoints(&self, endpoints: &Endpoints);
+
+    /// What a sample of another participant holds, or what an own writer keeps.
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Decoded;
+
+    /// The sample of a message. `durable`: it is kept for late joiners.
+    ///
+    /// # Errors
+    /// Why it is dropped.
+    fn encode(&self, topic: &Topic, message: &Body, durable: bool) -> Result<Encoded, DropReason>;
+
+    /// What own readers of a topic get of a message that this participant writes, if anything.
+    fn own(&self, topic: &Topic, message: &Body) -> Option<Content>;
+}
+
+/// What belongs to one life of a participant, beside readers and writers of topics.
+pub(crate) trait Companion: Send {
+    /// Is called some times a second. Returns whether others have given this participant up.
+    fn tick(&mut self, now: Instant, own: GuidPrefix, others: &Others<'_>) -> bool;
+}
+
+/// What a broker has counted since it was opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct DdsCounts {
+    /// Samples that were malformed.
+    pub malformed: u64,
+    /// How often RustDDS died and was built anew.
+    pub rebuilds: u64,
+    /// Participants to whom good-bye was said in their absence.
+    pub expelled: u64,
+}
+
+/// A participant with its threads.
+pub(crate) struct Adapter {
+    shared: Arc<Shared>,
+    threads: Mutex<Vec<StoppableThread>>,
+}
+
+impl Adapter {
+    /// Starts in the background: the status tells how far it is. An interface that is missing is no
+    /// error: it is looked for each second.
+    ///
+    /// # Errors
+    /// [`DdsError`] where there is no thread for it.
+    pub(crate) fn open(
+        dialect: Arc<dyn Dialect>,
+        domain: u16,
+        address: Ipv4Addr,
+    ) -> Result<Self, DdsError> {
+        let shared = Shared::new(dialect, domain, address);
+        let threads = vec![
+            life::start(&shared)?,
+            send::start(&shared)?,
+            channel::start(&shared, false)?,
+            channel::start(&shared, true)?,
+        ];
+        Ok(Self { shared, threads: Mutex::new(threads) })
+    }
+
+    pub(crate) fn counts(&self) -> DdsCounts {
+        *self.shared.counts.lock()
+    }
+
+    pub(crate) fn status(&self) -> watch::Receiver<BrokerStatus> {
+        self.shared.status.subscribe()
+    }
+
+    /// Ends or blocks the event loop of RustDDS, for tests of what follows.
+    #[cfg(feature = "fault-injection")]
+    pub(crate) fn inject(&self, fault: super::Fault) {
+        *self.shared.fault.lock() = Some(fault);
+        self.shared.wake_lifecycle();
+    }
+
+    /// Why nothing can be read or written now, if so.
+    pub(crate) fn check_up(&self) -> Result<(), BrokerError> {
+        self.check_open()?;
+        if self.shared.is_up() { Ok(()) } else { Err(self.shared.away()) }
+    }
+
+    /// Why nothing can be written or read now.
+    pub(crate) fn away(&self) -> BrokerError {
+        self.shared.away()
+    }
+
+    fn check_open(&self) -> Result<(), BrokerError> {
+        if self.shared.closing.load(Ordering::Acquire) {
+            return Err(BrokerError::Closed);
+        }
+        Ok(())
+    }
+
+    /// Writes a topic.
+    pub(crate) fn publisher(
+        &self,
+        topic: Topic,
+        options: PublisherOptions,
+    ) -> Result<TopicPublisher, BrokerError> {
+        self.check_open()?;
+        let longest_wait =
+            if options.reliable || options.depth > 0 { RELIABLE_WAIT } else { LONGEST_WAIT };
+        Ok(self.publisher_of(Target::new(&self.shared, topic, options), longest_wait))
+    }
+
+    /// Writes a topic with one writer for all that is published, which keeps the last `depth` for
+    /// late joiners, whoever wrote them.
+    pub(crate) fn keeping(&self, topic: Topic, depth: u32) -> TopicPublisher {
+        self.publisher_of(Target::keeping(&self.shared, topic, depth), RELIABLE_WAIT)
+    }
+
+    fn publisher_of(&self, target: Target, longest_wait: Duration) -> TopicPublisher {
+        LanePublisher {
+            lane: self.shared.outbox.lane(target, Some(longest_wait)),
+            admission: Arc::clone(&self.shared),
+        }
+    }
+
+    /// Reads a topic.
+    pub(crate) async fn subscribe(
+        &self,
+        topic: Topic,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
+        self.check_up()?;
+        let (sender, subscription) = crate::port::subscription(options);
+        let made = self.shared.channels.add(topic, sender, options)?;
+        self.shared.wake_lifecycle();
+        match tokio::time::timeout(SUBSCRIBE, made).await {
+            Ok(Ok(())) => Ok(subscription),
+            Ok(Err(_)) => Err(BrokerError::Closed),
+            Err(_) => Err(BrokerError::Away("RustDDS made no reader in time".to_owned())),
+        }
+    }
+
+    /// Delivers what was taken, as far as that goes within a second, and ends all threads.
+    pub(crate) async fn close(&self) {
+        if self.shared.closing.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        let until = Instant::now() + DRAIN;
+        let up = || self.shared.is_up();
+        while up()
+            && Instant::now() < until
+            && !(self.shared.is_drained() && self.shared.slots.are_acknowledged())
+        {
+            tokio::time::sleep(LOOK).await;
+        }
+        if up() {
+            tokio::time::sleep(LINGER).await;
+        }
+        self.shared.end();
+        let threads = std::mem::take(&mut *self.threads.lock());
+        // Joins the threads: the good-bye takes a moment.
+        let _ = tokio::task::spawn_blocking(move || drop(threads)).await;
+    }
+}
+
+impl Drop for Adapter {
+    fn drop(&mut self) {
+        self.shared.closing.store(true, Ordering::Release);
+        self.shared.end();
+        for thread in std::mem::take(&mut *self.threads.lock()) {
+            drop(thread.unwaited());
+        }
+    }
+}
+
+/// Writes one topic.
+pub(crate) type TopicPublisher = LanePublisher<Target, Arc<Shared>>;
+
+impl Admission for Arc<Shared> {
+    fn is_shut(&self) -> bool {
+        self.is_down()
+    }
+}
