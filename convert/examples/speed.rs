@@ -1,5 +1,7 @@
 //! Time of both conversions for some types: `cargo run --release -p blaze-convert --example speed`.
 
+#![allow(clippy::expect_used, reason = "a measurement stops where it cannot go on")]
+
 use std::time::{Duration, Instant};
 
 use blaze_convert::{Distro, Program, built_in};
