@@ -153,7 +153,8 @@ class Rosbags:
         self.names = [name for name in sorted(self.store.types) if not name.startswith("rosbag2_") and not self.has_empty(name)]
 
     def fields(self, name: str):
-        return [(field, self.kind(kind)) for field, kind in self.store.fielddefs[name][1]]
+        fields = self.store.fielddefs[name][1]
+        return [(field, self.kind(kind)) for field, kind in fields if field != "structure_needs_at_least_one_member"]
 
     def kind(self, found) -> tuple:
         node, about = found
@@ -170,6 +171,10 @@ class Rosbags:
         nested = [kind[-1] if kind[0] in ("array", "sequence") else kind for _, kind in fields]
         names = [kind[1] for kind in nested if kind[0] == "message"]
         return not fields or any(self.has_empty(each) for each in names)
+
+    def has_char(self, name: str) -> bool:
+        kinds = [kind[-1] if kind[0] in ("array", "sequence") else kind for _, kind in self.fields(name)]
+        return ("char",) in kinds or any(self.has_char(kind[1]) for kind in kinds if kind[0] == "message")
 
     def message(self, name: str, value: dict):
         return self.store.types[name](**{field: self.made(kind, value[field]) for field, kind in self.fields(name)})
@@ -321,11 +326,19 @@ def compare_hashes(program: str, release: str, share: Path, report: Report) -> i
                 folder.mkdir(parents=True, exist_ok=True)
                 shutil.copy(file, folder)
         built_in = [name for name in names if not name.startswith("test_msgs/")]
-        for kind, folders, asked in (("descriptions", [str(share)], names), ("texts", [texts], names), ("built in", [], built_in)):
+        # Some types of test_msgs are there as IDL alone.
+        texted = [name for name in names if has_text(Path(texts), name)]
+        ways = (("descriptions", [str(share)], names), ("texts", [texts], texted), ("built in", [], built_in))
+        for kind, folders, asked in ways:
             found = Convert(program, release, *folders).hashes(asked)
             for name, text in zip(asked, found, strict=True):
                 report.check(text == known[name], name, "hash", kind, text, known[name])
     return len(names)
+
+
+def has_text(folder: Path, name: str) -> bool:
+    package, group, part = name.split("/")
+    return (folder / package / group / f"{part if group == 'msg' else part.split('_')[0]}.{group}").is_file()
 
 
 def main() -> int:
@@ -334,7 +347,9 @@ def main() -> int:
     rosbags = Rosbags(release)
     hashes = Convert(program, release).hashes(rosbags.names)
     for name, found in zip(rosbags.names, hashes, strict=True):
-        report.check(found == rosbags.store.hash_rihs01(name), name, "hash of rosbags", found)
+        # It takes `char` for another kind than ROS 2 does.
+        if not rosbags.has_char(name):
+            report.check(found == rosbags.store.hash_rihs01(name), name, "hash of rosbags", found)
     total = compare(Convert(program, release), rosbags, count, report)
     print(f"{release}: rosbags {rosbags.store and len(rosbags.names)} types, {total} values, {len(hashes)} hashes", flush=True)
     if release != "humble":

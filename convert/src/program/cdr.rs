@@ -9,8 +9,10 @@ pub(super) const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 
 /// Bytes after a message that round its length up.
 const PADDING: usize = 3;
-/// Bytes that Fast DDS reserves for a wide string and does not use.
-const SPARE_OF_WIDE: usize = 8;
+/// Fast DDS reserves up to so many bytes too many for a wide string, and for an empty sequence of
+/// values of 8 bytes. They are no part of a message that it publishes, but of one that an application
+/// has serialized itself.
+const RESERVED: usize = 8;
 
 pub(super) struct Reader<'a> {
     /// What follows the encapsulation.
@@ -86,8 +88,9 @@ impl<'a> Reader<'a> {
         Ok(count)
     }
 
-    pub(super) fn wide_was_read(&mut self) {
-        self.spare += SPARE_OF_WIDE;
+    /// More may follow the message.
+    pub(super) fn reserved(&mut self) {
+        self.spare += RESERVED;
     }
 
     /// # Errors

@@ -95,9 +95,9 @@ impl Program {
     }
 
     /// Appends the JSON of a message to `out`. `cdr` is the encapsulation (4 bytes) and the message,
-    /// little or big endian. Up to 3 bytes may follow it; after a message with wide strings 8 more for
-    /// each, which Fast DDS reserves for it and does not use. More means that the bytes are not of this
-    /// type.
+    /// little or big endian. Up to 3 bytes may follow it, and 8 more for each wide string and each empty
+    /// sequence of values of 8 bytes, for which Fast DDS reserves too much. More means that the bytes
+    /// are not of this type.
     ///
     /// # Errors
     /// If the bytes are not of the type, are of another representation, or either side is larger than

@@ -62,8 +62,10 @@ impl Way<'_, '_> {
             Many::Array(size) => size,
             Many::Sequence(most) => self.cdr.count(most, 1)?,
         };
-        if item == Item::Byte {
-            return self.base64(count);
+        match item {
+            Item::Byte => return self.base64(count),
+            Item::Int64 | Item::UInt64 | Item::Float64 if count == 0 => self.cdr.reserved(),
+            _ => {}
         }
         self.out.push(b'[');
         for index in 0..count {
@@ -191,7 +193,7 @@ impl Way<'_, '_> {
                 Err(_) => return Err(Fault::text(format!("{unit:#x} is not a UTF-16 unit"))),
             }
         }
-        self.cdr.wide_was_read();
+        self.cdr.reserved();
         self.quoted(&String::from_utf16_lossy(&units));
         Ok(())
     }
