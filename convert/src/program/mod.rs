@@ -12,7 +12,13 @@ mod scalar;
 mod to_json;
 
 #[cfg(test)]
+mod fuzz;
+#[cfg(test)]
+mod properties;
+#[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod values;
 
 use std::ops::Range;
 
