@@ -76,6 +76,9 @@ pub enum DescriptionError {
     /// It is not JSON of the expected members.
     #[error("not a type description: {0}")]
     Syntax(String),
+    /// The answer of a node that does not have it.
+    #[error("the node has no description: {0}")]
+    Refused(String),
     /// A name that is none.
     #[error("{0:?} is not a name of a type")]
     TypeName(String),
@@ -119,7 +122,7 @@ impl TypeDescription {
     /// # Errors
     /// For JSON of other members, names that are none, and more than the limits allow.
     pub fn from_json(json: &[u8]) -> Result<Self, DescriptionError> {
-        checked(serde_json::from_slice(limited(json)?))
+        read::<Self>(json)?.checked()
     }
 
     /// Reads a `.json` file of a `share` tree. Other types that the file has (the parts of a service)
@@ -128,8 +131,7 @@ impl TypeDescription {
     /// # Errors
     /// As [`TypeDescription::from_json`].
     pub fn from_file(json: &[u8]) -> Result<Self, DescriptionError> {
-        let file = serde_json::from_slice::<DescriptionFile>(limited(json)?);
-        checked(file.map(|file| file.type_description_msg))
+        read::<DescriptionFile>(json)?.type_description_msg.checked()
     }
 
     /// The hash that ROS 2 gives the type.
@@ -141,6 +143,16 @@ impl TypeDescription {
     /// All types, the type itself first.
     pub fn types(&self) -> impl Iterator<Item = &IndividualType> {
         std::iter::once(&self.type_description).chain(&self.referenced_type_descriptions)
+    }
+
+    /// The same with the referenced types sorted by name, as the hash needs them.
+    ///
+    /// # Errors
+    /// As [`TypeDescription::check`].
+    pub(crate) fn checked(mut self) -> Result<Self, DescriptionError> {
+        self.check()?;
+        self.referenced_type_descriptions.sort_by(|a, b| a.type_name.cmp(&b.type_name));
+        Ok(self)
     }
 
     /// Whether names and sizes are within the limits.
@@ -188,9 +200,9 @@ impl Field {
     }
 }
 
-fn limited(json: &[u8]) -> Result<&[u8], DescriptionError> {
+fn read<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<T, DescriptionError> {
     at_most("bytes", json.len(), MAX_DEFINITION_BYTES)?;
-    Ok(json)
+    serde_json::from_slice(json).map_err(|error| DescriptionError::Syntax(error.to_string()))
 }
 
 /// # Errors
@@ -204,15 +216,6 @@ pub(crate) fn at_most(
         return Err(DescriptionError::TooLarge { what, found, limit });
     }
     Ok(())
-}
-
-fn checked(
-    read: Result<TypeDescription, serde_json::Error>,
-) -> Result<TypeDescription, DescriptionError> {
-    let mut description = read.map_err(|error| DescriptionError::Syntax(error.to_string()))?;
-    description.check()?;
-    description.referenced_type_descriptions.sort_by(|a, b| a.type_name.cmp(&b.type_name));
-    Ok(description)
 }
 
 /// Whether the text has the form `package/msg/Name`; `srv` and `action` likewise.

@@ -11,6 +11,7 @@
 //! Everything but [`Folders`] is pure: no input or output, no clock, no asynchronous code. No input
 //! panics, and none takes more time or memory than the limits of [`limits`] allow.
 
+mod answer;
 mod built_in;
 mod definitions;
 mod description;

@@ -267,6 +267,50 @@ class Rclpy:
         return self.serialization.serialize_message(message)
 
 
+SAMPLES = """
+test_msgs/msg/BasicTypes test_msgs/msg/Strings test_msgs/msg/WStrings test_msgs/msg/Defaults test_msgs/msg/Empty
+test_msgs/msg/BoundedPlainSequences test_msgs/msg/Nested sensor_msgs/msg/Imu diagnostic_msgs/msg/DiagnosticArray
+rcl_interfaces/msg/Parameter nav_msgs/srv/GetPlan_Request service_msgs/msg/ServiceEventInfo
+""".split()
+
+
+def definition(share: Path, name: str) -> str:
+    """Text of a message and of all that it refers to in its own package."""
+    package, _, file = name.split("/")
+    lines = [line.split("#")[0].strip() for line in (share / package / "msg" / f"{file}.msg").read_text().splitlines()]
+    text = "".join(f"{line}\n" for line in lines if line)
+    nested = {line.split()[0].split("[")[0] for line in lines if line[:1].isupper()}
+    return text + "".join(f"===\nMSG: {package}/{each}\n{definition(share, f'{package}/msg/{each}')}" for each in sorted(nested))
+
+
+def samples() -> None:
+    """What the tests of blaze-convert read without Python: convert/src/program/samples.json."""
+    share = Path(sys.prefix) / "share"
+    rclpy = Rclpy(share)
+    made = []
+    for name in SAMPLES:
+        package, group, file = name.split("/")
+        hashes = json.loads((share / package / group / f"{file.split('_')[0]}.json").read_text())["type_hashes"]
+        value = rclpy.values.message(name)
+        made.append({
+            "type": name,
+            "definition": definition(share, name) if package == "test_msgs" else None,
+            "hash": next(each["hash_string"] for each in hashes if each["type_name"] == name),
+            "cdr": base64.b64encode(rclpy.cdr(name, value)).decode(),
+            "json": shortest(as_json(value)),
+        })  # fmt: skip
+    print("[\n" + ",\n".join(json.dumps(each, ensure_ascii=False, separators=(",", ":")) for each in made) + "\n]")
+
+
+def shortest(value):
+    """float32 with as many digits as it needs."""
+    if isinstance(value, dict):
+        return {name: shortest(member) for name, member in value.items()}
+    if isinstance(value, list):
+        return [shortest(element) for element in value]
+    return float(str(numpy.float32(value))) if isinstance(value, F32) else value
+
+
 class Report:
     def __init__(self):
         self.faults = []
@@ -342,6 +386,9 @@ def has_text(folder: Path, name: str) -> bool:
 
 
 def main() -> int:
+    if sys.argv[1] == "samples":
+        samples()
+        return 0
     release, count, program = sys.argv[1], int(sys.argv[2]), sys.argv[3]
     report = Report()
     rosbags = Rosbags(release)
