@@ -319,7 +319,7 @@ class Report:
         if not good:
             self.faults.append(about)
             if len(self.faults) <= 20:
-                print("DIFFERENT", *(str(each)[:300] for each in about))
+                print("DIFFERENT", *(str(each)[:300] for each in about), file=sys.stderr)
 
 
 def compare(convert: Convert, other, count: int, report: Report) -> int:
@@ -398,14 +398,14 @@ def main() -> int:
         if not rosbags.has_char(name):
             report.check(found == rosbags.store.hash_rihs01(name), name, "hash of rosbags", found)
     total = compare(Convert(program, release), rosbags, count, report)
-    print(f"{release}: rosbags {rosbags.store and len(rosbags.names)} types, {total} values, {len(hashes)} hashes", flush=True)
+    print(f"{release}: rosbags {len(rosbags.names)} types, {total} values, {len(hashes)} hashes", file=sys.stderr)
     if release != "humble":
         share = Path(sys.prefix) / "share"
         rclpy = Rclpy(share)
         total = compare(Convert(program, release, str(share)), rclpy, count, report)
         hashes = compare_hashes(program, release, share, report)
-        print(f"{release}: rclpy {len(rclpy.names)} types, {total} values; {hashes} hashes of the share tree, three ways", flush=True)
-    print(f"{release}: {len(report.faults)} differences", flush=True)
+        print(f"{release}: rclpy {len(rclpy.names)} types, {total} values; {hashes} hashes of the share tree, three ways", file=sys.stderr)
+    print(f"{release}: {len(report.faults)} differences", file=sys.stderr)
     return 1 if report.faults else 0
 
 

@@ -14,6 +14,8 @@ mod to_json;
 #[cfg(test)]
 mod fuzz;
 #[cfg(test)]
+mod limit_tests;
+#[cfg(test)]
 mod properties;
 #[cfg(test)]
 mod samples;

@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::str::FromStr;
 
+use base64::DecodeSliceError;
 use base64::Engine;
 use base64::alphabet::STANDARD;
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
@@ -155,8 +156,9 @@ fn text(json: &str) -> Result<Cow<'_, str>, Box<Fault>> {
     if !inner.contains('\\') {
         return Ok(Cow::Borrowed(inner));
     }
-    let text = serde_json::from_str(json);
-    text.map(Cow::Owned).map_err(|error| Fault::text(format!("expected a text: {error}")))
+    // Its escapes are valid, so nothing else can be wrong.
+    let text = serde_json::from_str(json).map_err(|_| Fault::text("half of a surrogate pair"));
+    text.map(Cow::Owned)
 }
 
 fn check_nul(text: &str) -> Done {
@@ -207,7 +209,10 @@ pub(super) fn write_base64(
     let text = text(json)?;
     let room = base64::decoded_len_estimate(text.len());
     let written = BASE64.decode_slice(text.as_bytes(), cdr.zeros(room));
-    let written = written.map_err(|error| Fault::text(format!("not base64: {error}")))?;
+    let written = written.map_err(|error| match error {
+        DecodeSliceError::DecodeError(error) => Fault::text(format!("not base64: {error}")),
+        DecodeSliceError::OutputSliceTooSmall => Fault::too_large(),
+    })?;
     cdr.take_back(room - written);
     check_length(written, most, "elements")?;
     Ok(written)
