@@ -1,5 +1,4 @@
-//! Finds the definition of a type: in what is built in, in folders, and in what was learned while the
-//! program runs.
+//! Finds the definition of a type: in what is built in, in folders, and among those that were added at run time.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -13,7 +12,7 @@ use crate::hash::TypeHash;
 use crate::limits::MAX_ADDED;
 use crate::pool::Pool;
 
-/// Where a definition comes from, in the order in which it is sought.
+/// Source of a definition, in the order of the search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Source {
     /// Part of this program.
@@ -48,7 +47,7 @@ impl fmt::Display for Source {
 /// A definition that was found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Definition {
-    /// Where it comes from.
+    /// Its source.
     pub source: Source,
     /// The type and all that it refers to.
     pub description: Arc<TypeDescription>,

@@ -38,7 +38,7 @@ pub struct IndividualType {
 pub struct Field {
     /// Its name, which is that of the JSON member.
     pub name: String,
-    /// What it holds.
+    /// Its type.
     #[serde(rename = "type")]
     pub ty: FieldType,
     /// Empty for none; as written in the definition, a single string without quotes.
@@ -46,7 +46,7 @@ pub struct Field {
     pub default_value: String,
 }
 
-/// What a field holds.
+/// Type of a field.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FieldType {
     /// A number of `type_description_interfaces/msg/FieldType`.
@@ -101,11 +101,11 @@ pub enum DescriptionError {
     /// Larger than a limit.
     #[error("has {found} {what}, at most {limit} are allowed")]
     TooLarge {
-        /// What was counted.
+        /// The unit that was counted.
         what: &'static str,
-        /// How much there is.
+        /// The number found.
         found: usize,
-        /// How much is allowed.
+        /// The number allowed.
         limit: usize,
     },
 }

@@ -18,7 +18,7 @@ use crate::text::{TextError, parse_action, parse_message, parse_service};
 pub struct Warning {
     /// The folder or file.
     pub path: PathBuf,
-    /// What is wrong with it.
+    /// The fault.
     pub text: String,
 }
 

@@ -66,8 +66,7 @@ const NAMES: &[(Base, &str)] = &[
     (Base::BoundedWString, "wstring"),
 ];
 
-/// Those that stand for themselves in [`FieldType::type_id`]; `long double`, `wchar` and strings of
-/// fixed length have no place in message files and are not read.
+/// All supported types. Message files have no `long double`, `wchar` or strings of fixed length.
 const ALL: &[Base] = &[
     Base::Nested,
     Base::Int8,
@@ -103,7 +102,7 @@ impl Base {
     }
 }
 
-/// How many values a field has.
+/// Number of values of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
     /// One.
@@ -154,14 +153,14 @@ impl FieldType {
         Self { nested_type_name: name.into(), ..Self::plain(Base::Nested, shape, 0) }
     }
 
-    /// What a value, or one element, is. `None` for a number that stands for nothing we read.
+    /// Type of the value, or of one element. `None` for a number of no supported type.
     #[must_use]
     pub fn base(&self) -> Option<Base> {
         let number = self.type_id % STEP;
         ALL.iter().copied().find(|base| *base as u8 == number)
     }
 
-    /// How many values there are.
+    /// Number of values. `None` for a number of no supported type.
     #[must_use]
     pub fn shape(&self) -> Option<Shape> {
         match self.type_id / STEP {

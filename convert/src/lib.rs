@@ -11,7 +11,6 @@
 //! Everything but [`Folders`] is pure: no input or output, no clock, no asynchronous code. No input
 //! panics, and none takes more time or memory than the limits of [`limits`] allow.
 
-mod answer;
 mod built_in;
 mod definitions;
 mod description;
@@ -23,6 +22,7 @@ mod literal;
 mod parts;
 mod pool;
 mod program;
+mod response;
 mod text;
 mod write_text;
 

@@ -1,4 +1,4 @@
-//! What no definition and no message may exceed.
+//! Limits of definitions and messages.
 
 /// Largest message as CDR with its encapsulation, and as JSON, in bytes (16 MiB): the largest payload
 /// of a topic.

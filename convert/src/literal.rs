@@ -3,7 +3,7 @@
 
 use crate::kinds::{Base, Shape};
 
-/// What is wrong with a default, in words.
+/// A fault of a default, in words.
 type Fault = &'static str;
 
 /// The default as JSON.

@@ -15,7 +15,7 @@ const PADDING: usize = 3;
 const RESERVED: usize = 8;
 
 pub(super) struct Reader<'a> {
-    /// What follows the encapsulation.
+    /// The bytes after the encapsulation.
     data: &'a [u8],
     at: usize,
     big: bool,
@@ -115,7 +115,7 @@ pub(super) fn check_length(found: usize, most: usize, unit: &str) -> Result<(), 
 
 pub(super) struct Writer<'o> {
     out: &'o mut Vec<u8>,
-    /// Where the first value is in `out`.
+    /// Index of the first value in `out`.
     start: usize,
 }
 

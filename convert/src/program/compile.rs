@@ -1,8 +1,8 @@
-//! From a description to a program.
+//! Makes a program of a description.
 
 use std::collections::HashMap;
 
-use super::{FieldOp, Item, Many, MessageOp, Program, from_json};
+use super::{Arity, FieldOp, Item, MessageOp, Program, from_json};
 use crate::description::{DescriptionError, Field, IndividualType, TypeDescription};
 use crate::kinds::{Base, Shape};
 use crate::limits::{MAX_MESSAGE_BYTES, MAX_NESTING};
@@ -49,7 +49,7 @@ pub enum CompileError {
         field: String,
         /// As the definition has it.
         default: String,
-        /// What is wrong.
+        /// The reason.
         fault: String,
     },
 }
@@ -112,18 +112,18 @@ fn field_op(
         || CompileError::Unsupported { field: place(ty, field), type_id: field.ty.type_id };
     let base = field.ty.base().ok_or_else(unsupported)?;
     let shape = field.ty.shape().ok_or_else(unsupported)?;
-    let many = match shape {
-        Shape::Single => Many::One,
+    let arity = match shape {
+        Shape::Single => Arity::Single,
         Shape::Array(0) | Shape::Bounded(0) => return Err(CompileError::Size(place(ty, field))),
-        Shape::Array(size) => Many::Array(bound(size)),
-        Shape::Bounded(size) => Many::Sequence(bound(size)),
-        Shape::Unbounded => Many::Sequence(usize::MAX),
+        Shape::Array(size) => Arity::Array(bound(size)),
+        Shape::Bounded(size) => Arity::Sequence(bound(size)),
+        Shape::Unbounded => Arity::Sequence(usize::MAX),
     };
     Ok(FieldOp {
         name: field.name.as_str().into(),
         key: format!("\"{}\":", field.name).into(),
         item: item(ty, field, base, numbers)?,
-        many,
+        arity,
         default: None,
     })
 }
@@ -231,10 +231,10 @@ impl Sizes<'_> {
             Item::Int64 | Item::UInt64 | Item::Float64 => (0, 8),
             Item::Message(number) => self.of(number, above)?,
         };
-        Ok(match field.many {
-            Many::One => (depth, least),
-            Many::Array(size) => (depth + 1, least.saturating_mul(size)),
-            Many::Sequence(_) => (depth + 1, 4),
+        Ok(match field.arity {
+            Arity::Single => (depth, least),
+            Arity::Array(size) => (depth + 1, least.saturating_mul(size)),
+            Arity::Sequence(_) => (depth + 1, 4),
         })
     }
 }

@@ -1,4 +1,4 @@
-//! What is wrong with a message, and where.
+//! Faults of messages and their places.
 
 use std::fmt;
 
@@ -15,7 +15,7 @@ pub enum ConvertError {
     Value {
         /// JSON pointer of the value, empty for the message itself.
         pointer: String,
-        /// What was expected, and what was found.
+        /// The expected and the found value.
         text: String,
     },
 }

@@ -1,7 +1,7 @@
-//! From JSON to CDR.
+//! Writes CDR from JSON.
 //!
-//! Members that come in the order of the definition are written as they are read. One that comes early
-//! is kept as text until its turn, so CDR is always written forwards.
+//! Members in the order of the definition are written as they are read. A member that is ahead of its turn
+//! is kept as text until then, so CDR is always written forwards.
 
 use serde::Deserializer as _;
 use serde::de::{DeserializeSeed, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
@@ -10,7 +10,7 @@ use serde_json::value::RawValue;
 
 use super::cdr::{Writer, check_length};
 use super::error::{ConvertError, Fault};
-use super::{FieldOp, Item, Many, Program, scalar};
+use super::{Arity, FieldOp, Item, Program, scalar};
 use crate::limits::MAX_MESSAGE_BYTES;
 
 type Done = Result<(), Box<Fault>>;
@@ -24,10 +24,10 @@ pub(super) fn message(program: &Program, json: &[u8], cdr: Writer<'_>) -> Done {
         return Err(Fault::too_large());
     }
     let text = std::str::from_utf8(json).map_err(|error| Fault::text(error.to_string()))?;
-    let mut way = Way { program, cdr, fault: None };
-    way.parse(text, Item::Message(0), Many::One)?;
-    // A message may be written in pieces that are checked before they are written, and end with others.
-    way.cdr.room(0)
+    let mut encoder = Encoder { program, cdr, fault: None };
+    encoder.parse(text, Item::Message(0), Arity::Single)?;
+    // The last value may have been checked before it was written.
+    encoder.cdr.room(0)
 }
 
 /// Whether the JSON is a value of the field.
@@ -40,58 +40,58 @@ pub(super) fn check_default(
     json: &str,
 ) -> Result<(), ConvertError> {
     let mut out = Vec::new();
-    let mut way = Way { program, cdr: Writer::new(&mut out), fault: None };
-    way.parse(json, field.item, field.many).map_err(ConvertError::from)
+    let mut encoder = Encoder { program, cdr: Writer::new(&mut out), fault: None };
+    encoder.parse(json, field.item, field.arity).map_err(ConvertError::from)
 }
 
-struct Way<'a, 'o> {
+struct Encoder<'a, 'o> {
     program: &'a Program,
     cdr: Writer<'o>,
-    /// What is wrong, while the parser's own error goes up.
+    /// The fault, while the error of the parser returns through its callers.
     fault: Option<Box<Fault>>,
 }
 
-impl<'a> Way<'a, '_> {
-    fn parse(&mut self, json: &str, item: Item, many: Many) -> Done {
+impl<'a> Encoder<'a, '_> {
+    fn parse(&mut self, json: &str, item: Item, arity: Arity) -> Done {
         let mut parser = Deserializer::from_str(json);
-        let done = Values { way: self, item, many }.deserialize(&mut parser);
-        done.and_then(|()| parser.end()).map_err(|error| self.faulty(&error))
+        let done = Values { encoder: self, item, arity }.deserialize(&mut parser);
+        done.and_then(|()| parser.end()).map_err(|error| self.take_fault(&error))
     }
 
-    /// What was wrong: with a value, else with the text.
-    fn faulty(&mut self, error: &impl Error) -> Box<Fault> {
+    /// The fault of a value, else that of the text.
+    fn take_fault(&mut self, error: &impl Error) -> Box<Fault> {
         self.fault.take().unwrap_or_else(|| Fault::text(error.to_string()))
     }
 
-    /// Keeps what is wrong and makes the error that stops the parser.
-    fn stop<E: Error>(&mut self, fault: Box<Fault>) -> E {
+    /// Keeps the fault and returns an error that stops the parser.
+    fn abort<E: Error>(&mut self, fault: Box<Fault>) -> E {
         self.fault = Some(fault);
         E::custom("")
     }
 
-    fn stop_in_member<E: Error>(&mut self, field: &FieldOp, error: &E) -> E {
-        let fault = self.faulty(error).in_member(&field.name);
-        self.stop(fault)
+    fn abort_in_member<E: Error>(&mut self, field: &FieldOp, error: &E) -> E {
+        let fault = self.take_fault(error).in_member(&field.name);
+        self.abort(fault)
     }
 
     fn field(&self, message: usize, at: usize) -> Option<&'a FieldOp> {
         self.program.fields_of(message).get(at)
     }
 
-    /// What stands for a member that is missing.
+    /// Writes the default of a missing member, or zeros.
     fn missing(&mut self, field: &FieldOp) -> Done {
         match &field.default {
-            Some(json) => self.parse(json, field.item, field.many),
-            None => self.zeros(field.item, field.many),
+            Some(json) => self.parse(json, field.item, field.arity),
+            None => self.zeros(field.item, field.arity),
         }
         .map_err(|fault| fault.in_member(&field.name))
     }
 
-    fn zeros(&mut self, item: Item, many: Many) -> Done {
-        let count = match many {
-            Many::One => 1,
-            Many::Array(size) => size,
-            Many::Sequence(_) => {
+    fn zeros(&mut self, item: Item, arity: Arity) -> Done {
+        let count = match arity {
+            Arity::Single => 1,
+            Arity::Array(size) => size,
+            Arity::Sequence(_) => {
                 self.cdr.scalar([0; 4]);
                 0
             }
@@ -120,40 +120,40 @@ impl<'a> Way<'a, '_> {
         Ok(())
     }
 
-    /// The members from `next` on: those that came early, and what stands for the others.
+    /// Writes the members from `next` on: pending ones, and defaults.
     fn missing_members(
         &mut self,
         message: usize,
         next: usize,
-        early: &mut [Option<&RawValue>],
+        pending: &mut [Option<&RawValue>],
     ) -> Done {
         let fields = self.program.fields_of(message);
         if fields.is_empty() {
             self.cdr.scalar([0; 1]);
         }
         for (at, field) in fields.iter().enumerate().skip(next) {
-            match early.get_mut(at).and_then(Option::take) {
-                Some(json) => self.early(field, json)?,
+            match pending.get_mut(at).and_then(Option::take) {
+                Some(json) => self.write_pending(field, json)?,
                 None => self.missing(field)?,
             }
         }
         Ok(())
     }
 
-    fn early(&mut self, field: &FieldOp, json: &RawValue) -> Done {
-        let done = self.parse(json.get(), field.item, field.many);
+    fn write_pending(&mut self, field: &FieldOp, json: &RawValue) -> Done {
+        let done = self.parse(json.get(), field.item, field.arity);
         done.map_err(|fault| fault.in_member(&field.name))
     }
 
     /// One value that is no message and no list.
-    fn scalar(&mut self, item: Item, many: Many, json: &str) -> Done {
-        match many {
-            Many::One => scalar::write(&mut self.cdr, item, json)?,
-            Many::Array(size) => {
+    fn scalar(&mut self, item: Item, arity: Arity, json: &str) -> Done {
+        match arity {
+            Arity::Single => scalar::write(&mut self.cdr, item, json)?,
+            Arity::Array(size) => {
                 let found = scalar::write_base64(&mut self.cdr, json, size)?;
                 check_size(size, found)?;
             }
-            Many::Sequence(most) => {
+            Arity::Sequence(most) => {
                 let place = self.cdr.count_later();
                 let found = scalar::write_base64(&mut self.cdr, json, most)?;
                 self.cdr.set_count(place, found);
@@ -172,31 +172,31 @@ fn check_size(size: usize, found: usize) -> Done {
 
 /// All values of a field.
 struct Values<'w, 'a, 'o> {
-    way: &'w mut Way<'a, 'o>,
+    encoder: &'w mut Encoder<'a, 'o>,
     item: Item,
-    many: Many,
+    arity: Arity,
 }
 
 impl<'de> DeserializeSeed<'de> for Values<'_, '_, '_> {
     type Value = ();
 
     fn deserialize<D: serde::Deserializer<'de>>(self, parser: D) -> Result<(), D::Error> {
-        let Self { way, item, many } = self;
-        match (item, many) {
-            (Item::Message(number), Many::One) => {
-                parser.deserialize_any(Members { way, message: number })
+        let Self { encoder, item, arity } = self;
+        match (item, arity) {
+            (Item::Message(number), Arity::Single) => {
+                parser.deserialize_any(Members { encoder, message: number })
             }
-            (item, many) if many == Many::One || item == Item::Byte => {
+            (item, arity) if arity == Arity::Single || item == Item::Byte => {
                 let json: &RawValue = serde::Deserialize::deserialize(parser)?;
                 // Bytes may also be written as numbers.
-                if many != Many::One && json.get().starts_with('[') {
-                    let list = Elements { way, item, many };
+                if arity != Arity::Single && json.get().starts_with('[') {
+                    let list = Elements { encoder, item, arity };
                     let read = Deserializer::from_str(json.get()).deserialize_any(list);
                     return read.map_err(D::Error::custom);
                 }
-                way.scalar(item, many, json.get()).map_err(|fault| way.stop(fault))
+                encoder.scalar(item, arity, json.get()).map_err(|fault| encoder.abort(fault))
             }
-            (item, many) => parser.deserialize_any(Elements { way, item, many }),
+            (item, arity) => parser.deserialize_any(Elements { encoder, item, arity }),
         }
     }
 }
@@ -208,31 +208,31 @@ macro_rules! other_kinds {
             out.write_str($expected)
         }
         fn visit_bool<E: Error>(self, _: bool) -> Result<(), E> {
-            Err(self.way.stop(scalar::other_kind($expected, "a bool")))
+            Err(self.encoder.abort(scalar::other_kind($expected, "a bool")))
         }
         fn visit_i64<E: Error>(self, _: i64) -> Result<(), E> {
-            Err(self.way.stop(scalar::other_kind($expected, "a number")))
+            Err(self.encoder.abort(scalar::other_kind($expected, "a number")))
         }
         fn visit_u64<E: Error>(self, _: u64) -> Result<(), E> {
-            Err(self.way.stop(scalar::other_kind($expected, "a number")))
+            Err(self.encoder.abort(scalar::other_kind($expected, "a number")))
         }
         fn visit_f64<E: Error>(self, _: f64) -> Result<(), E> {
-            Err(self.way.stop(scalar::other_kind($expected, "a number")))
+            Err(self.encoder.abort(scalar::other_kind($expected, "a number")))
         }
         fn visit_str<E: Error>(self, _: &str) -> Result<(), E> {
-            Err(self.way.stop(scalar::other_kind($expected, "text")))
+            Err(self.encoder.abort(scalar::other_kind($expected, "text")))
         }
         fn visit_unit<E: Error>(self) -> Result<(), E> {
-            Err(self.way.stop(scalar::other_kind($expected, "null")))
+            Err(self.encoder.abort(scalar::other_kind($expected, "null")))
         }
     };
 }
 
 /// A list.
 struct Elements<'w, 'a, 'o> {
-    way: &'w mut Way<'a, 'o>,
+    encoder: &'w mut Encoder<'a, 'o>,
     item: Item,
-    many: Many,
+    arity: Arity,
 }
 
 impl<'de> Visitor<'de> for Elements<'_, '_, '_> {
@@ -241,25 +241,25 @@ impl<'de> Visitor<'de> for Elements<'_, '_, '_> {
     other_kinds!("an array");
 
     fn visit_map<A: MapAccess<'de>>(self, _: A) -> Result<(), A::Error> {
-        Err(self.way.stop(scalar::other_kind("an array", "an object")))
+        Err(self.encoder.abort(scalar::other_kind("an array", "an object")))
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<(), A::Error> {
-        let Self { way, item, many } = self;
-        let (place, most) = match many {
-            Many::One => (None, 1),
-            Many::Array(size) => (None, size),
-            Many::Sequence(most) => (Some(way.cdr.count_later()), most),
+        let Self { encoder, item, arity } = self;
+        let (place, most) = match arity {
+            Arity::Single => (None, 1),
+            Arity::Array(size) => (None, size),
+            Arity::Sequence(most) => (Some(encoder.cdr.count_later()), most),
         };
         let mut count = 0;
         while count < most {
-            let next = Values { way: &mut *way, item, many: Many::One };
+            let next = Values { encoder: &mut *encoder, item, arity: Arity::Single };
             match list.next_element_seed(next) {
                 Ok(Some(())) => count += 1,
                 Ok(None) => break,
                 Err(error) => {
-                    let fault = way.faulty(&error).in_element(count);
-                    return Err(way.stop(fault));
+                    let fault = encoder.take_fault(&error).in_element(count);
+                    return Err(encoder.abort(fault));
                 }
             }
         }
@@ -268,16 +268,16 @@ impl<'de> Visitor<'de> for Elements<'_, '_, '_> {
             found += 1;
         }
         if let Some(place) = place {
-            way.cdr.set_count(place, count);
-            return check_length(found, most, "elements").map_err(|fault| way.stop(fault));
+            encoder.cdr.set_count(place, count);
+            return check_length(found, most, "elements").map_err(|fault| encoder.abort(fault));
         }
-        check_size(most, found).map_err(|fault| way.stop(fault))
+        check_size(most, found).map_err(|fault| encoder.abort(fault))
     }
 }
 
 /// An object.
 struct Members<'w, 'a, 'o> {
-    way: &'w mut Way<'a, 'o>,
+    encoder: &'w mut Encoder<'a, 'o>,
     message: usize,
 }
 
@@ -287,55 +287,57 @@ impl<'de> Visitor<'de> for Members<'_, '_, '_> {
     other_kinds!("an object");
 
     fn visit_seq<A: SeqAccess<'de>>(self, _: A) -> Result<(), A::Error> {
-        Err(self.way.stop(scalar::other_kind("an object", "an array")))
+        Err(self.encoder.abort(scalar::other_kind("an object", "an array")))
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<(), A::Error> {
-        let Self { way, message } = self;
+        let Self { encoder, message } = self;
         let mut next = 0;
-        let mut early: Vec<Option<&'de RawValue>> = Vec::new();
+        let mut pending: Vec<Option<&'de RawValue>> = Vec::new();
         loop {
-            let name = Name { way: &mut *way, message, next, early: &early };
+            let name = Name { encoder: &mut *encoder, message, next, pending: &pending };
             let Some(at) = members.next_key_seed(name)? else { break };
-            let Some(field) = way.field(message, at) else { break };
+            let Some(field) = encoder.field(message, at) else { break };
             if at != next {
-                early.resize(way.program.fields_of(message).len(), None);
+                pending.resize(encoder.program.fields_of(message).len(), None);
                 let json =
-                    members.next_value().map_err(|error| way.stop_in_member(field, &error))?;
-                if let Some(kept) = early.get_mut(at) {
+                    members.next_value().map_err(|error| encoder.abort_in_member(field, &error))?;
+                if let Some(kept) = pending.get_mut(at) {
                     *kept = Some(json);
                 }
                 continue;
             }
-            let value = Values { way: &mut *way, item: field.item, many: field.many };
-            members.next_value_seed(value).map_err(|error| way.stop_in_member(field, &error))?;
+            let value = Values { encoder: &mut *encoder, item: field.item, arity: field.arity };
+            members
+                .next_value_seed(value)
+                .map_err(|error| encoder.abort_in_member(field, &error))?;
             next += 1;
-            while let Some(json) = early.get_mut(next).and_then(Option::take) {
-                let Some(field) = way.field(message, next) else { break };
-                way.early(field, json).map_err(|fault| way.stop(fault))?;
+            while let Some(json) = pending.get_mut(next).and_then(Option::take) {
+                let Some(field) = encoder.field(message, next) else { break };
+                encoder.write_pending(field, json).map_err(|fault| encoder.abort(fault))?;
                 next += 1;
             }
         }
-        way.missing_members(message, next, &mut early).map_err(|fault| way.stop(fault))
+        encoder.missing_members(message, next, &mut pending).map_err(|fault| encoder.abort(fault))
     }
 }
 
 /// The name of a member: which field it is.
 struct Name<'w, 'a, 'o, 'e> {
-    way: &'w mut Way<'a, 'o>,
+    encoder: &'w mut Encoder<'a, 'o>,
     message: usize,
     /// The next field to be written.
     next: usize,
-    early: &'e [Option<&'e RawValue>],
+    pending: &'e [Option<&'e RawValue>],
 }
 
 impl Name<'_, '_, '_, '_> {
     fn place(&self, name: &str) -> Option<usize> {
-        let fields = self.way.program.fields_of(self.message);
+        let fields = self.encoder.program.fields_of(self.message);
         if fields.get(self.next).is_some_and(|field| *field.name == *name) {
             return Some(self.next);
         }
-        let by_name = &self.way.program.message(self.message)?.by_name;
+        let by_name = &self.encoder.program.message(self.message)?.by_name;
         let name_at = |at: &u32| fields.get(*at as usize).map(|field| &*field.name);
         let found = by_name.binary_search_by(|at| name_at(at).cmp(&Some(name))).ok()?;
         by_name.get(found).map(|at| *at as usize)
@@ -360,11 +362,11 @@ impl Visitor<'_> for Name<'_, '_, '_, '_> {
     fn visit_str<E: Error>(self, name: &str) -> Result<usize, E> {
         let fault = match self.place(name) {
             None => "no such member",
-            Some(at) if at < self.next || self.early.get(at).is_some_and(Option::is_some) => {
+            Some(at) if at < self.next || self.pending.get(at).is_some_and(Option::is_some) => {
                 "the member is there twice"
             }
             Some(at) => return Ok(at),
         };
-        Err(self.way.stop(Fault::text(fault).in_member(name)))
+        Err(self.encoder.abort(Fault::text(fault).in_member(name)))
     }
 }

@@ -17,7 +17,7 @@ mod long {
 
     /// Longest time of one input. The largest are far below it.
     const SLOW: Duration = Duration::from_secs(5);
-    /// What joins the bytes of an input.
+    /// Pieces that are put into inputs.
     const WORDS: &[&[u8]] = &[
         b"\"",
         b"{",
@@ -132,7 +132,7 @@ mod long {
         });
     }
 
-    /// What compiles is also converted: its zeros must be a message within the limits.
+    /// Converts a message of zeros, if the type can be compiled.
     fn compiled(description: &TypeDescription) {
         if let Ok(program) = Program::compile(description) {
             let (mut out, mut text) = (Vec::new(), Vec::new());

@@ -1,4 +1,4 @@
-//! What no message and no type may do: lie about lengths, nest without end, take more than the limits.
+//! Limits: lengths that lie, nesting without end, messages and types that are too large.
 
 use super::tests::{again, cdr, compile, fault_of_bytes, le};
 use super::*;

@@ -33,7 +33,7 @@ use crate::description::TypeDescription;
 use cdr::{ENCAPSULATION, Reader, Writer};
 use error::Fault;
 
-/// What one value is.
+/// Type of one value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Item {
     Bool,
@@ -56,10 +56,10 @@ enum Item {
     Message(usize),
 }
 
-/// How many of them a field has.
+/// Number of values of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Many {
-    One,
+enum Arity {
+    Single,
     /// Always as many.
     Array(usize),
     /// A number, then at most as many.
@@ -72,7 +72,7 @@ struct FieldOp {
     /// `"name":`
     key: Box<str>,
     item: Item,
-    many: Many,
+    arity: Arity,
     /// JSON of what stands for a missing member, unless that is zero.
     default: Option<Box<str>>,
 }

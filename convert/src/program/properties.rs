@@ -1,4 +1,4 @@
-//! What holds for every value of every built-in type.
+//! Properties of every value of every built-in type.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ fn cases() -> u32 {
     if std::env::var_os("BLAZE_LONG").is_some() { 1_000 } else { 4 }
 }
 
-/// One that has what no built-in type has.
+/// A type with kinds of fields that no built-in type has.
 const OWN: &str = "wstring w\nwstring<=3 x\nwstring[2] y\nwstring<=5[<=2] z\nstring<=4 s\nstring<=6[] t\n\
     byte[3] b\nchar[] c\nint8[<=3] i\nbool[2] o\nuint64[] u\nfloat32[<=2] f\nstd_msgs/Empty e\n\
     std_msgs/Empty[<=2] m\ngeometry_msgs/Pose[2] p\nint16 n\n";

@@ -53,7 +53,7 @@ pub(super) fn other_kind(expected: &str, found: &str) -> Box<Fault> {
     Fault::text(format!("expected {expected}, found {found}"))
 }
 
-/// What a valid JSON text is, by its first character.
+/// Kind of a valid JSON value, by its first character.
 fn kind(json: &str) -> &'static str {
     match json.as_bytes().first() {
         Some(b'{') => "an object",
@@ -194,7 +194,7 @@ fn write_wide(cdr: &mut Writer<'_>, text: &str, most: usize) -> Done {
     Ok(())
 }
 
-/// Writes the bytes of a base64 text. How many there are.
+/// Writes the bytes of a base64 text. Returns their number.
 ///
 /// # Errors
 /// If the JSON is no such text, or has more bytes than `most`.

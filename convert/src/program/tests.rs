@@ -37,7 +37,7 @@ fn both(text: &str, json_text: &str, bytes: &[u8]) {
     assert_eq!(json(&program, &le(&[bytes])).as_deref(), Ok(json_text));
 }
 
-/// What the JSON becomes once it has been CDR.
+/// JSON of the CDR that is made of the JSON.
 pub(super) fn again(program: &Program, json_text: &str) -> Result<String, String> {
     json(program, &cdr(program, json_text)?)
 }

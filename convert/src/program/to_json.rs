@@ -1,4 +1,4 @@
-//! From CDR to JSON.
+//! Writes JSON from CDR.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -6,7 +6,7 @@ use serde_json::ser::{CompactFormatter, Formatter};
 
 use super::cdr::{Reader, check_length};
 use super::error::Fault;
-use super::{Item, Many, Program};
+use super::{Arity, Item, Program};
 use crate::limits::MAX_MESSAGE_BYTES;
 
 type Done = Result<(), Box<Fault>>;
@@ -16,19 +16,19 @@ type Done = Result<(), Box<Fault>>;
 /// # Errors
 /// As [`Program::to_json`].
 pub(super) fn message(program: &Program, cdr: Reader<'_>, out: &mut Vec<u8>) -> Done {
-    let mut way = Way { program, cdr, start: out.len(), out };
-    way.message(0)?;
-    way.cdr.end()
+    let mut decoder = Decoder { program, cdr, start: out.len(), out };
+    decoder.message(0)?;
+    decoder.cdr.end()
 }
 
-struct Way<'a, 'o> {
+struct Decoder<'a, 'o> {
     program: &'a Program,
     cdr: Reader<'a>,
     out: &'o mut Vec<u8>,
     start: usize,
 }
 
-impl Way<'_, '_> {
+impl Decoder<'_, '_> {
     fn message(&mut self, number: usize) -> Done {
         let program = self.program;
         let fields = program.fields_of(number);
@@ -39,7 +39,7 @@ impl Way<'_, '_> {
         for (index, field) in fields.iter().enumerate() {
             self.separate(index);
             self.out.extend_from_slice(field.key.as_bytes());
-            self.values(field.item, field.many).map_err(|fault| fault.in_member(&field.name))?;
+            self.values(field.item, field.arity).map_err(|fault| fault.in_member(&field.name))?;
         }
         self.out.push(b'}');
         Ok(())
@@ -56,11 +56,11 @@ impl Way<'_, '_> {
         if size > MAX_MESSAGE_BYTES { Err(Fault::too_large()) } else { Ok(()) }
     }
 
-    fn values(&mut self, item: Item, many: Many) -> Done {
-        let count = match many {
-            Many::One => return self.value(item),
-            Many::Array(size) => size,
-            Many::Sequence(most) => self.cdr.count(most, 1)?,
+    fn values(&mut self, item: Item, arity: Arity) -> Done {
+        let count = match arity {
+            Arity::Single => return self.value(item),
+            Arity::Array(size) => size,
+            Arity::Sequence(most) => self.cdr.count(most, 1)?,
         };
         match item {
             Item::Byte => return self.base64(count),

@@ -1,9 +1,9 @@
 //! Random values of any type, for tests.
 
 use super::cdr::{ENCAPSULATION, Writer};
-use super::{Item, Many, Program, scalar};
+use super::{Arity, Item, Program, scalar};
 
-/// Where the values come from: bytes, and then zeros, so every value ends.
+/// The source of the values: bytes, and then zeros, so every value ends.
 pub(super) struct Entropy<'a>(pub(super) &'a [u8]);
 
 impl Entropy<'_> {
@@ -64,10 +64,10 @@ impl Maker<'_, '_, '_> {
             self.cdr.scalar([0]);
         }
         for field in fields {
-            let count = match field.many {
-                Many::One => 1,
-                Many::Array(size) => size,
-                Many::Sequence(most) => {
+            let count = match field.arity {
+                Arity::Single => 1,
+                Arity::Array(size) => size,
+                Arity::Sequence(most) => {
                     let count = self.entropy.below(if depth < 3 { 5 } else { 2 }).min(most);
                     self.cdr.scalar((count as u32).to_le_bytes());
                     count

@@ -6,7 +6,7 @@ use super::{TextError, check_size, package_of, parse_part};
 use crate::description::TypeDescription;
 use crate::pool::Pool;
 
-/// What a part of a text defines.
+/// Kind of a definition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     Message,

@@ -26,7 +26,7 @@ pub enum TextError {
         type_name: String,
         /// Its number, from 1.
         line: usize,
-        /// What was expected.
+        /// The expected form, and the text found.
         fault: String,
     },
     /// A service needs one line of `---`, an action two.

@@ -1,4 +1,4 @@
-//! Type descriptions that come as messages: the answer of a node's `get_type_description`.
+//! Type descriptions that come as messages: the response of a node's `get_type_description`.
 
 use serde::Deserialize;
 
@@ -7,11 +7,11 @@ use crate::description::{DescriptionError, TypeDescription};
 use crate::program::Program;
 
 const DESCRIPTION: &str = "type_description_interfaces/msg/TypeDescription";
-const ANSWER: &str = "type_description_interfaces/srv/GetTypeDescription_Response";
+const RESPONSE: &str = "type_description_interfaces/srv/GetTypeDescription_Response";
 
-/// What we need of the answer.
+/// The members that are needed.
 #[derive(Deserialize)]
-struct Answer {
+struct Response {
     successful: bool,
     failure_reason: String,
     type_description: TypeDescription,
@@ -29,14 +29,14 @@ impl TypeDescription {
     /// Reads CDR of `type_description_interfaces/srv/GetTypeDescription_Response`.
     ///
     /// # Errors
-    /// As [`TypeDescription::from_cdr`], and if the node says that it has no description.
-    pub fn from_answer(cdr: &[u8]) -> Result<Self, DescriptionError> {
-        let answer: Answer = serde_json::from_slice(&json(ANSWER, cdr)?)
+    /// As [`TypeDescription::from_cdr`], and for a response without a description.
+    pub fn from_response(cdr: &[u8]) -> Result<Self, DescriptionError> {
+        let response: Response = serde_json::from_slice(&json(RESPONSE, cdr)?)
             .map_err(|error| DescriptionError::Syntax(error.to_string()))?;
-        if !answer.successful {
-            return Err(DescriptionError::Refused(answer.failure_reason));
+        if !response.successful {
+            return Err(DescriptionError::Refused(response.failure_reason));
         }
-        answer.type_description.checked()
+        response.type_description.checked()
     }
 }
 
@@ -64,24 +64,24 @@ mod tests {
     }
 
     #[test]
-    fn answers_of_nodes_are_read() {
+    fn responses_of_nodes_are_read() {
         let twist = built_in(Distro::Jazzy).describe("geometry_msgs/msg/Twist").expect("built in");
         let json = serde_json::to_string(&twist).expect("JSON");
         assert_eq!(TypeDescription::from_cdr(&cdr(DESCRIPTION, &json)), Ok(twist.clone()));
-        let answer = format!(r#"{{"successful":true,"type_description":{json}}}"#);
-        assert_eq!(TypeDescription::from_answer(&cdr(ANSWER, &answer)), Ok(twist));
+        let response = format!(r#"{{"successful":true,"type_description":{json}}}"#);
+        assert_eq!(TypeDescription::from_response(&cdr(RESPONSE, &response)), Ok(twist));
     }
 
     #[test]
     fn a_node_may_have_no_description() {
-        let answer = cdr(ANSWER, r#"{"failure_reason":"no such type"}"#);
-        let error = TypeDescription::from_answer(&answer).expect_err("none");
+        let response = cdr(RESPONSE, r#"{"failure_reason":"no such type"}"#);
+        let error = TypeDescription::from_response(&response).expect_err("none");
         assert_eq!(error.to_string(), "the node has no description: no such type");
-        let answer = cdr(ANSWER, r#"{"successful":true}"#);
+        let response = cdr(RESPONSE, r#"{"successful":true}"#);
         assert_eq!(
-            TypeDescription::from_answer(&answer),
+            TypeDescription::from_response(&response),
             Err(DescriptionError::TypeName(String::new()))
         );
-        assert!(TypeDescription::from_answer(&[0, 1, 0, 0, 1]).is_err());
+        assert!(TypeDescription::from_response(&[0, 1, 0, 0, 1]).is_err());
     }
 }
