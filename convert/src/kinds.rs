@@ -44,12 +44,15 @@ pub enum Base {
     BoundedWString = 22,
 }
 
-/// Names in message files. A bounded string has its name and its bound.
+/// All supported types and their names in message files, which have no `long double`, `wchar` or strings
+/// of fixed length. A bounded string has its name and its bound; a nested type has none.
 const NAMES: &[(Base, &str)] = &[
+    (Base::Nested, ""),
     (Base::Bool, "bool"),
     (Base::Byte, "byte"),
     (Base::Int8, "int8"),
     (Base::UInt8, "uint8"),
+    // In message files it is `uint8`, in IDL files a type of its own.
     (Base::UInt8, "char"),
     (Base::Char, "char"),
     (Base::Int16, "int16"),
@@ -66,33 +69,12 @@ const NAMES: &[(Base, &str)] = &[
     (Base::BoundedWString, "wstring"),
 ];
 
-/// All supported types. Message files have no `long double`, `wchar` or strings of fixed length.
-const ALL: &[Base] = &[
-    Base::Nested,
-    Base::Int8,
-    Base::UInt8,
-    Base::Int16,
-    Base::UInt16,
-    Base::Int32,
-    Base::UInt32,
-    Base::Int64,
-    Base::UInt64,
-    Base::Float32,
-    Base::Float64,
-    Base::Char,
-    Base::Bool,
-    Base::Byte,
-    Base::String,
-    Base::WString,
-    Base::BoundedString,
-    Base::BoundedWString,
-];
-
 impl Base {
     /// The type that message files call so.
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
-        NAMES.iter().find(|(_, known)| *known == name).map(|(base, _)| *base)
+        let found = NAMES.iter().find(|(_, known)| *known == name && !name.is_empty());
+        found.map(|(base, _)| *base)
     }
 
     /// Its name in message files, without a bound; empty for a nested type.
@@ -157,7 +139,7 @@ impl FieldType {
     #[must_use]
     pub fn base(&self) -> Option<Base> {
         let number = self.type_id % STEP;
-        ALL.iter().copied().find(|base| *base as u8 == number)
+        NAMES.iter().map(|(base, _)| *base).find(|base| *base as u8 == number)
     }
 
     /// Number of values. `None` for a number of no supported type.

@@ -88,6 +88,11 @@ impl<'a> Reader<'a> {
         Ok(count)
     }
 
+    /// Skips the byte of a message without fields. Some writers leave it out at the end.
+    pub(super) fn skip_empty(&mut self) {
+        self.at = self.data.len().min(self.at + 1);
+    }
+
     /// More may follow the message.
     pub(super) fn reserved(&mut self) {
         self.spare += RESERVED;

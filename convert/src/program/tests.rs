@@ -54,6 +54,8 @@ pub(super) fn fault_of_bytes(text: &str, bytes: &[u8]) -> String {
 fn messages_are_objects_in_the_order_of_the_definition() {
     both("int8 b\nuint8 A=1\nint8 a\n", r#"{"b":1,"a":2}"#, &[1, 2]);
     both("uint8 A=1\n", "{}", &[0]);
+    // Some writers send no byte for it.
+    assert_eq!(json(&compile("uint8 A=1\n"), &ENCAPSULATION).as_deref(), Ok("{}"));
     both("std_msgs/Empty e\nint8 x\n", r#"{"e":{},"x":3}"#, &[0, 3]);
     both(
         "builtin_interfaces/Time stamp\n",

@@ -33,7 +33,7 @@ impl Decoder<'_, '_> {
         let program = self.program;
         let fields = program.fields_of(number);
         if fields.is_empty() {
-            self.cdr.bytes(1)?;
+            self.cdr.skip_empty();
         }
         self.out.push(b'{');
         for (index, field) in fields.iter().enumerate() {
