@@ -9,7 +9,7 @@ use crate::built_in::{Distro, built_in};
 use crate::description::{DescriptionError, TypeDescription, at_most};
 use crate::folders::{Folders, Warning};
 use crate::hash::TypeHash;
-use crate::limits::MAX_ADDED;
+use crate::limits::{MAX_ADDED, MAX_ADDED_BYTES};
 use crate::pool::Pool;
 
 /// Source of a definition, in the order of the search.
@@ -68,6 +68,7 @@ pub struct Definitions {
     folders: Folders,
     added: HashMap<String, Vec<Definition>>,
     count: usize,
+    bytes: usize,
 }
 
 impl Definitions {
@@ -77,33 +78,35 @@ impl Definitions {
     pub fn new(distro: Distro, folders: Vec<PathBuf>) -> (Self, Vec<Warning>) {
         let (folders, warnings) = Folders::new(folders);
         let built_in = Arc::new(built_in(distro));
-        (Self { built_in, folders, added: HashMap::new(), count: 0 }, warnings)
+        (Self { built_in, folders, added: HashMap::new(), count: 0, bytes: 0 }, warnings)
     }
 
     /// Other folders and another release, with the definitions that were added.
     #[must_use]
     pub fn reloaded(self, distro: Distro, folders: Vec<PathBuf>) -> (Self, Vec<Warning>) {
         let (new, warnings) = Self::new(distro, folders);
-        (Self { added: self.added, count: self.count, ..new }, warnings)
+        (Self { built_in: new.built_in, folders: new.folders, ..self }, warnings)
     }
 
     /// Keeps a definition of a node or flow. Of one hash there is one: the first stays.
     ///
     /// # Errors
-    /// For a description that is none, and above [`MAX_ADDED`] descriptions.
+    /// For a description that is none, and above [`MAX_ADDED`] descriptions or [`MAX_ADDED_BYTES`].
     pub fn add(
         &mut self,
         source: Source,
         description: TypeDescription,
     ) -> Result<(), DescriptionError> {
-        description.check()?;
-        let new = Definition::new(source, description);
+        let new = Definition::new(source, description.checked()?);
         let name = &new.description.type_description.type_name;
         let same = |known: &Definition| (known.source, known.hash) == (new.source, new.hash);
         if self.added.get(name).is_some_and(|of_name| of_name.iter().any(same)) {
             return Ok(());
         }
         at_most("descriptions", self.count + 1, MAX_ADDED)?;
+        let bytes = self.bytes + new.description.bytes();
+        at_most("bytes of descriptions", bytes, MAX_ADDED_BYTES)?;
+        self.bytes = bytes;
         self.count += 1;
         let of_name = self.added.entry(name.clone()).or_default();
         let place = of_name.partition_point(|known| known.source <= new.source);
@@ -187,6 +190,15 @@ mod tests {
         all.add(Source::Node, of_text("a/msg/B0", "int8 x\n")).expect("it is there");
         let error = all.add(Source::Node, of_text("a/msg/C", "int8 x\n")).expect_err("full");
         assert_eq!(error.to_string(), "has 4097 descriptions, at most 4096 are allowed");
+        let large = " ".repeat(1024 * 1024 - 100);
+        let (mut small, _) = Definitions::new(Distro::Jazzy, Vec::new());
+        let error = (0..100).find_map(|index| {
+            let mut description = of_text(&format!("a/msg/B{index}"), "string x\n");
+            description.type_description.fields[0].default_value.clone_from(&large);
+            small.add(Source::Node, description).err()
+        });
+        let text = error.expect("full").to_string();
+        assert!(text.ends_with("bytes of descriptions, at most 67108864 are allowed"), "{text}");
         let (all, _) = all.reloaded(Distro::Humble, Vec::new());
         let found = all.find("a/msg/B7", None, &mut Vec::new()).expect("it was added");
         assert_eq!((found.source, found.source.as_str()), (Source::Node, "node"));

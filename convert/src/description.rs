@@ -145,6 +145,19 @@ impl TypeDescription {
         std::iter::once(&self.type_description).chain(&self.referenced_type_descriptions)
     }
 
+    /// Memory that it takes, in bytes, about.
+    pub(crate) fn bytes(&self) -> usize {
+        let of_field = |field: &Field| {
+            let texts = [&field.name, &field.default_value, &field.ty.nested_type_name];
+            size_of::<Field>() + texts.map(String::len).iter().sum::<usize>()
+        };
+        let of_type = |ty: &IndividualType| {
+            let fields: usize = ty.fields.iter().map(of_field).sum();
+            size_of::<IndividualType>() + ty.type_name.len() + fields
+        };
+        self.types().map(of_type).sum()
+    }
+
     /// The same with the referenced types sorted by name, as the hash needs them.
     ///
     /// # Errors

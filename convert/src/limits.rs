@@ -20,5 +20,8 @@ pub const MAX_DEFINITION_BYTES: usize = 1024 * 1024;
 /// Most descriptions that [`Definitions`](crate::Definitions) keeps of nodes and flows.
 pub const MAX_ADDED: usize = 4_096;
 
+/// Most bytes of these descriptions together, about (64 MiB).
+pub const MAX_ADDED_BYTES: usize = 64 * 1024 * 1024;
+
 /// Longest name of a type or field, in bytes, as in `type_description_interfaces`.
 pub const MAX_NAME_BYTES: usize = 255;
