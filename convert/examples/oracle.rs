@@ -4,9 +4,9 @@
 //! oracle DISTRO [FOLDER…]   folders as in `interfaces`; they come before what is built in
 //! ```
 //!
-//! A line of the input is a type, what to do, and base64, with tabs between: `json` makes JSON of CDR,
-//! `cdr` makes CDR of JSON, `hash` needs no third part. The answer is `ok` and base64 (of a hash its
-//! text), or `error` and a text.
+//! A line of the input is a type, what to do, and base64, with tabs between: `json` makes JSON of
+//! CDR, `cdr` makes CDR of JSON, `hash` needs no third part. The answer is `ok` and base64 (of a
+//! hash its text), or `error` and a text.
 
 #![allow(clippy::expect_used, reason = "a test stops where it cannot go on")]
 

@@ -34,7 +34,8 @@ fn measure(name: &str, json: &str) {
         program.to_cdr(&text, &mut cdr).expect("a message");
     });
     println!(
-        "{name}: {} bytes of CDR, {} of JSON: compiled in {compiling:?}, to JSON {to_json:?}, to CDR {to_cdr:?}",
+        "{name}: {} bytes of CDR, {} of JSON; compiled in {compiling:?}, to JSON {to_json:?}, \
+         to CDR {to_cdr:?}",
         cdr.len(),
         text.len()
     );
@@ -48,10 +49,12 @@ fn main() {
         "nav_msgs/msg/Odometry",
         &format!(
             r#"{{"header":{{"stamp":{{"sec":1764325012,"nanosec":123456789}},"frame_id":"odom"}},
-            "child_frame_id":"base_link","pose":{{"pose":{{"position":{{"x":12.3456789,"y":-0.98765,"z":0.1}},
-            "orientation":{{"x":0.0012,"y":-0.0034,"z":0.70710678,"w":0.70710678}}}},"covariance":[{covariance}]}},
-            "twist":{{"twist":{{"linear":{{"x":0.45678,"y":0,"z":0}},"angular":{{"x":0,"y":0,"z":0.1234567}}}},
-            "covariance":[{covariance}]}}}}"#
+            "child_frame_id":"base_link",
+            "pose":{{"pose":{{"position":{{"x":12.3456789,"y":-0.98765,"z":0.1}},
+            "orientation":{{"x":0.0012,"y":-0.0034,"z":0.70710678,"w":0.70710678}}}},
+            "covariance":[{covariance}]}},
+            "twist":{{"twist":{{"linear":{{"x":0.45678,"y":0,"z":0}},
+            "angular":{{"x":0,"y":0,"z":0.1234567}}}},"covariance":[{covariance}]}}}}"#
         ),
     );
     let zeros = vec!["0.1"; 640].join(",");

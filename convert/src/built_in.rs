@@ -1,6 +1,6 @@
 //! Definitions that every ROS 2 installation has, for each release.
 //!
-//! `definitions/` has them as text: what all releases have in common, and a file for each release. Its
+//! `definitions/` has them as text: one file for all releases, and one for each. Its
 //! `ORIGIN.md` names source and licences; `scripts/ros-definitions` makes the files.
 
 use std::fmt;

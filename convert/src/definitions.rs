@@ -1,4 +1,4 @@
-//! Finds the definition of a type: in what is built in, in folders, and among those that were added at run time.
+//! Finds the definition of a type: built in, in folders, or added at run time.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -72,8 +72,8 @@ pub struct Definitions {
 }
 
 impl Definitions {
-    /// The built-in types of a release, and folders in the order in which they are searched. A folder
-    /// that is not there is a warning.
+    /// The built-in types of a release, and folders in the order in which they are searched. A
+    /// folder that is not there is a warning.
     #[must_use]
     pub fn new(distro: Distro, folders: Vec<PathBuf>) -> (Self, Vec<Warning>) {
         let (folders, warnings) = Folders::new(folders);
@@ -116,8 +116,8 @@ impl Definitions {
 
     /// The first definition of the name that has the hash; without a hash the first of the name.
     ///
-    /// Reads files of the folders if the type is not built in: call it where that may block. Faults of
-    /// those files are added to `warnings`.
+    /// Reads files of the folders if the type is not built in: call it where that may block. Faults
+    /// of those files are added to `warnings`.
     #[must_use]
     pub fn find(
         &self,

@@ -1,15 +1,15 @@
 //! The types themselves, in the form of ROS 2's own type descriptions.
 //!
 //! The members are named as in `type_description_interfaces/msg/TypeDescription`, so the same
-//! structures read the `.json` files of a `share` tree and what a node answers.
+//! structures read the `.json` files of a `share` tree and the responses of nodes.
 
 use serde::{Deserialize, Serialize};
 
 use crate::hash::TypeHash;
 use crate::limits::{MAX_DEFINITION_BYTES, MAX_FIELDS, MAX_NAME_BYTES, MAX_TYPES};
 
-/// The only field of a message without fields: C knows no empty structures. It is one byte in CDR and
-/// nothing in JSON.
+/// The only field of a message without fields: C knows no empty structures. It is one byte in CDR
+/// and nothing in JSON.
 pub(crate) const EMPTY_FIELD: &str = "structure_needs_at_least_one_member";
 
 /// A type and all types that it refers to, directly or not.
@@ -125,8 +125,8 @@ impl TypeDescription {
         read::<Self>(json)?.checked()
     }
 
-    /// Reads a `.json` file of a `share` tree. Other types that the file has (the parts of a service)
-    /// are among the referenced ones.
+    /// Reads a `.json` file of a `share` tree. Other types that the file has (the parts of a
+    /// service) are among the referenced ones.
     ///
     /// # Errors
     /// As [`TypeDescription::from_json`].

@@ -1,7 +1,8 @@
 //! Definitions in folders of the user: `share` trees, as ROS 2 installs them.
 //!
-//! A tree has `<package>/msg/<Name>.msg`, `srv/*.srv` and `action/*.action`, since Iron with a `.json`
-//! beside each. The files of a type are read when it is asked for, so a tree may change at any time.
+//! A tree has `<package>/msg/<Name>.msg`, `srv/*.srv` and `action/*.action`, since Iron with a
+//! `.json` beside each. The files of a type are read when it is asked for, so a tree may change at
+//! any time.
 
 use std::fmt;
 use std::fs::File;
@@ -35,8 +36,8 @@ pub struct Folders {
 }
 
 impl Folders {
-    /// The folders, and a warning for each that is not there. Such a one is searched all the same: it
-    /// may come later.
+    /// The folders, and a warning for each that is not there. Such a one is searched all the same:
+    /// it may come later.
     #[must_use]
     pub fn new(folders: Vec<PathBuf>) -> (Self, Vec<Warning>) {
         let missing = folders.iter().filter(|folder| !folder.is_dir());
@@ -46,8 +47,8 @@ impl Folders {
         (Self { folders }, warnings)
     }
 
-    /// Descriptions of a type, one for each folder that has it, in the order of the folders. Types that
-    /// it refers to are sought in the same folder, then in the others, then among `known`.
+    /// Descriptions of a type, one for each folder that has it, in the order of the folders. Types
+    /// that it refers to are sought in the same folder, then in the others, then among `known`.
     ///
     /// Reads files: call it where that may block. Faults of files are added to `warnings`.
     pub fn describe(
@@ -112,8 +113,8 @@ fn load(folder: &Path, name: &str, pool: &mut Pool, warnings: &mut Vec<Warning>)
     false
 }
 
-/// Package, group, and the name of the file without its extension: parts of a service or action have
-/// an underscore after the name that their file has.
+/// Package, group, and the name of the file without its extension: parts of a service or action
+/// have an underscore after the name that their file has.
 fn split(name: &str) -> Option<(&str, &str, &str)> {
     let (package, rest) = name.split_once('/')?;
     let (group, name) = rest.split_once('/')?;

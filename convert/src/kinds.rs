@@ -1,4 +1,4 @@
-//! The numbers of `type_description_interfaces/msg/FieldType` and what they mean.
+//! The numbers of `type_description_interfaces/msg/FieldType` and their meaning.
 
 use crate::description::FieldType;
 
@@ -44,8 +44,8 @@ pub enum Base {
     BoundedWString = 22,
 }
 
-/// All supported types and their names in message files, which have no `long double`, `wchar` or strings
-/// of fixed length. A bounded string has its name and its bound; a nested type has none.
+/// All supported types and their names in message files, which have no `long double`, `wchar` or
+/// strings of fixed length. A bounded string has its name and its bound; a nested type has none.
 const NAMES: &[(Base, &str)] = &[
     (Base::Nested, ""),
     (Base::Bool, "bool"),

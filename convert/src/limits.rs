@@ -1,7 +1,7 @@
 //! Limits of definitions and messages.
 
-/// Largest message as CDR with its encapsulation, and as JSON, in bytes (16 MiB): the largest payload
-/// of a topic.
+/// Largest message as CDR with its encapsulation, and as JSON, in bytes (16 MiB): the largest
+/// payload of a topic.
 pub const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
 
 /// Deepest nesting of a value: objects and arrays within each other. The JSON parser has a limit of

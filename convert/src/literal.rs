@@ -1,5 +1,5 @@
-//! Defaults of definitions, in the notations of message files (`[true, false]`, `"text"`) and of type
-//! descriptions (`(True, False)`, `text`), as the JSON that stands for the same value.
+//! Defaults of definitions, in the notations of message files (`[true, false]`, `"text"`) and of
+//! type descriptions (`(True, False)`, `text`), as the JSON that stands for the same value.
 
 use crate::kinds::{Base, Shape};
 
@@ -9,7 +9,7 @@ type Fault = &'static str;
 /// The default as JSON.
 ///
 /// # Errors
-/// Says what was expected.
+/// The expected form.
 pub(crate) fn to_json(text: &str, base: Base, shape: Shape) -> Result<String, Fault> {
     let mut rest = Rest(text.trim());
     if shape == Shape::Single {
@@ -39,8 +39,8 @@ pub(crate) fn to_json(text: &str, base: Base, shape: Shape) -> Result<String, Fa
     }
 }
 
-/// A text without its quotes, as `string` defaults of message files have them; text without quotes as
-/// it is. Of backslashes only those before a quote count.
+/// A text without its quotes, as `string` defaults of message files have them; text without quotes
+/// as it is. Of backslashes only those before a quote count.
 pub(crate) fn unquoted(text: &str) -> String {
     for quote in ['"', '\''] {
         let inner = text.strip_prefix(quote).and_then(|rest| rest.strip_suffix(quote));

@@ -10,8 +10,8 @@ pub(super) const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 /// Bytes after a message that round its length up.
 const PADDING: usize = 3;
 /// Fast DDS reserves up to so many bytes too many for a wide string, and for an empty sequence of
-/// values of 8 bytes. They are no part of a message that it publishes, but of one that an application
-/// has serialized itself.
+/// values of 8 bytes. They are no part of a message that it publishes, but of one that an
+/// application has serialized itself.
 const RESERVED: usize = 8;
 
 pub(super) struct Reader<'a> {
@@ -125,7 +125,7 @@ pub(super) struct Writer<'o> {
 }
 
 impl<'o> Writer<'o> {
-    /// Writes after what is in `out`, which ends with the encapsulation.
+    /// Appends to `out`, which ends with the encapsulation.
     pub(super) fn new(out: &'o mut Vec<u8>) -> Self {
         let start = out.len();
         Self { out, start }

@@ -1,7 +1,7 @@
 //! Writes CDR from JSON.
 //!
-//! Members in the order of the definition are written as they are read. A member that is ahead of its turn
-//! is kept as text until then, so CDR is always written forwards.
+//! Members in the order of the definition are written as they are read. A member that is ahead of
+//! its turn is kept as text until then, so CDR is always written forwards.
 
 use serde::Deserializer as _;
 use serde::de::{DeserializeSeed, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};

@@ -1,8 +1,8 @@
 //! A type as a program that takes its bytes to JSON and back.
 //!
 //! A description refers to its types by name; here each has a number, each field its JSON key, its
-//! kind and its default, and what could not end has been refused. Both ways stream: nothing stands
-//! between the bytes and the text but the way through the program.
+//! kind and its default, and types without an end have been refused. Both ways stream: there is no
+//! tree of values between the bytes and the text.
 
 mod cdr;
 mod compile;
@@ -73,7 +73,7 @@ struct FieldOp {
     key: Box<str>,
     item: Item,
     arity: Arity,
-    /// JSON of what stands for a missing member, unless that is zero.
+    /// JSON that stands for a missing member; zeros if there is none.
     default: Option<Box<str>>,
 }
 
@@ -97,21 +97,21 @@ impl Program {
     ///
     /// # Errors
     /// For kinds of values that are not read, types that refer to themselves or are not in the
-    /// description, nesting above [`MAX_NESTING`](crate::limits::MAX_NESTING), a type whose smallest
-    /// value exceeds [`MAX_MESSAGE_BYTES`](crate::limits::MAX_MESSAGE_BYTES), and defaults that are no
-    /// values.
+    /// description, nesting above [`MAX_NESTING`](crate::limits::MAX_NESTING), a type whose
+    /// smallest value exceeds [`MAX_MESSAGE_BYTES`](crate::limits::MAX_MESSAGE_BYTES), and defaults
+    /// that are no values.
     pub fn compile(description: &TypeDescription) -> Result<Self, CompileError> {
         compile::compile(description)
     }
 
-    /// Appends the JSON of a message to `out`. `cdr` is the encapsulation (4 bytes) and the message,
-    /// little or big endian. Up to 3 bytes may follow it, and 8 more for each wide string and each empty
-    /// sequence of values of 8 bytes, for which Fast DDS reserves too much. More means that the bytes
-    /// are not of this type.
+    /// Appends the JSON of a message to `out`. `cdr` is the encapsulation (4 bytes) and the
+    /// message, little or big endian. Up to 3 bytes may follow it, and 8 more for each wide string
+    /// and each empty sequence of values of 8 bytes, for which Fast DDS reserves too much. More
+    /// means that the bytes are not of this type.
     ///
     /// # Errors
-    /// If the bytes are not of the type, are of another representation, or either side is larger than
-    /// [`MAX_MESSAGE_BYTES`](crate::limits::MAX_MESSAGE_BYTES). `out` is as it was then.
+    /// If the bytes are not of the type, are of another representation, or either side is larger
+    /// than [`MAX_MESSAGE_BYTES`](crate::limits::MAX_MESSAGE_BYTES). `out` is as it was then.
     pub fn to_json(&self, cdr: &[u8], out: &mut Vec<u8>) -> Result<(), ConvertError> {
         let start = out.len();
         let done = Reader::new(cdr).and_then(|reader| to_json::message(self, reader, out));

@@ -16,9 +16,9 @@ fn cases() -> u32 {
 }
 
 /// A type with kinds of fields that no built-in type has.
-const OWN: &str = "wstring w\nwstring<=3 x\nwstring[2] y\nwstring<=5[<=2] z\nstring<=4 s\nstring<=6[] t\n\
-    byte[3] b\nchar[] c\nint8[<=3] i\nbool[2] o\nuint64[] u\nfloat32[<=2] f\nstd_msgs/Empty e\n\
-    std_msgs/Empty[<=2] m\ngeometry_msgs/Pose[2] p\nint16 n\n";
+const OWN: &str = "wstring w\nwstring<=3 x\nwstring[2] y\nwstring<=5[<=2] z\nstring<=4 s\n\
+    string<=6[] t\nbyte[3] b\nchar[] c\nint8[<=3] i\nbool[2] o\nuint64[] u\nfloat32[<=2] f\n\
+    std_msgs/Empty e\nstd_msgs/Empty[<=2] m\ngeometry_msgs/Pose[2] p\nint16 n\n";
 
 /// All types of all releases, each definition once.
 pub(super) fn programs() -> Vec<(String, Program)> {

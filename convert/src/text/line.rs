@@ -5,10 +5,10 @@ use crate::description::{Constant, Field, FieldType, IndividualType};
 use crate::kinds::{Base, Shape};
 use crate::literal;
 
-/// Adds what the line declares. Types without a package are those of `package`.
+/// Adds the field or constant of the line. Types without a package are those of `package`.
 ///
 /// # Errors
-/// Says what was expected.
+/// The expected form, and the text found.
 pub(super) fn parse(line: &str, package: &str, ty: &mut IndividualType) -> Result<(), String> {
     let line = without_comment(line);
     if line.is_empty() {
