@@ -1,5 +1,5 @@
 //! Inputs at random, changed from good ones, for as long as one likes: `BLAZE_FUZZ_SECONDS` for
-//! each of the four. The seed is printed with an input that fails.
+//! each of the four. An input that fails is printed.
 
 #[allow(dead_code, reason = "made for the data plane, which uses the rest")]
 #[path = "../../../dataplane/src/testing/random.rs"]
