@@ -72,9 +72,9 @@ impl Writer {
         octet_sequence(&[octets]).is_ok_and(|cdr| matches!(write(cdr), Written::Taken(_)))
     }
 
-    /// Hands a sample to RustDDS: not without a reader, unless it is kept for
-    /// late joiners, and not into the full window of a reliable writer. Best effort lets the oldest
-    /// that still wait give way. `options` travel with the sample.
+    /// Hands a sample to RustDDS: not without a reader, unless it is kept for late joiners, and not
+    /// into the full window of a reliable writer. Best effort lets the oldest that still wait give
+    /// way. `options` travel with the sample.
     pub fn write_cdr(&self, cdr: Cdr, options: WriteOptionsBuilder) -> Written {
         self.contain(|| {
             if !(self.is_matched_now() || self.keeps) {

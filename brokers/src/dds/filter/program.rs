@@ -17,6 +17,7 @@ const FRAGMENT: u32 = 256;
 const MAX_NACK_FRAGMENT: u32 = 0x3ff;
 /// Last fragment of a HEARTBEAT_FRAG, at least.
 const MAX_FRAGMENT: u32 = 0xffff;
+
 /// How many steps a filter has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Shape {
@@ -35,12 +36,13 @@ impl Shape {
     /// on loopback (65,536) for the 128 samples that may wait in a writer of 32 KiB samples.
     const LARGE: Self = Self { first: 4, quick: 160, packed: 0, last: 4 };
     /// What fits into the 20 KiB that a socket has for its options where `net.core.optmem_max` has
-    /// the value from before Linux 6.8; the large one needs 60 KiB. A packet of 1500 bytes holds at
-    /// most 15 of the link's datagrams.
+    /// the value from before Linux 6.8; the large one fits into 70,000 bytes and not into 66,000. A
+    /// packet of 1500 bytes holds at most 15 of the link's datagrams.
     const SMALL: Self = Self { first: 2, quick: 24, packed: 0, last: 2 };
     /// For other implementations: Cyclone packs some 60 announcements, each with its time, into one
     /// datagram, and heartbeats and acknowledgements of many endpoints. Fast DDS ends a datagram
-    /// with a fragment by a heartbeat and a submessage of its own. 4,070 instructions.
+    /// with a fragment by a heartbeat and a submessage of its own. 4,070 instructions, which fit
+    /// into 90,000 bytes and not into 80,000.
     const LARGE_ANY_VENDOR: Self = Self { first: 1, quick: 118, packed: 22, last: 2 };
     const SMALL_ANY_VENDOR: Self = Self { first: 2, quick: 16, packed: 3, last: 1 };
 
