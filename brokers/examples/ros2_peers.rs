@@ -6,6 +6,7 @@
 //! ros2_peers DOMAIN serve SECONDS     answers rq/add_two_intsRequest, with the identity of the request in the reply
 //! ros2_peers DOMAIN call COUNT        calls rq/add_two_intsRequest and looks for its identity in the replies
 //! ros2_peers DOMAIN watch SECONDS     prints the endpoints of others
+//! ros2_peers DOMAIN adapter SECONDS   rt/big -> rt/big_reply through the adapter, and prints what it knows of others
 //! ```
 //!
 //! All on 127.0.0.1. Figures of runs against Fast DDS and Cyclone: `docs/design/ros2.md`.
@@ -19,6 +20,8 @@ use std::time::{Duration, Instant};
 use blaze_brokers::dds::{
     Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer, Written,
 };
+use blaze_brokers::ros2::{GidLength, Ros2Config, Ros2Network, RosTopic};
+use blaze_brokers::{Content, Health, PublisherOptions, SubscribeOptions};
 use bytes::{BufMut, BytesMut};
 use rustdds::WriteOptionsBuilder;
 use rustdds::rpc::SampleIdentity;
@@ -35,6 +38,10 @@ fn main() -> Result<(), Error> {
     let [domain, task, count] = &arguments[..] else {
         return Err("usage: ros2_peers DOMAIN echo|late|serve|call|watch SECONDS|COUNT".into());
     };
+    if task == "adapter" {
+        let runtime = tokio::runtime::Runtime::new()?;
+        return runtime.block_on(adapter(domain.parse()?, Duration::from_secs(count.parse()?)));
+    }
     let mut config = ParticipantConfig::new(domain.parse()?, Ipv4Addr::LOCALHOST);
     config.largest_sample = 16 << 20;
     config.repairs_fragments = true;
@@ -227,5 +234,64 @@ fn watch(participant: &Participant, time: Duration) -> Result<(), Error> {
             );
         }
     }
+    Ok(())
+}
+
+/// Echoes what owned writers publish, through the adapter.
+async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
+    let network = Ros2Network::open(Ros2Config {
+        flow: "edge/robot-1".parse()?,
+        domain,
+        interface: Ipv4Addr::LOCALHOST,
+        namespace: String::new(),
+        gid: GidLength::Short,
+    })?;
+    let until = tokio::time::Instant::now() + time;
+    let mut status = network.status();
+    status.wait_for(|status| status.health == Health::Up).await?;
+    let topic = |name: &str| -> Result<RosTopic, Error> {
+        let type_name = "std_msgs/msg/UInt8MultiArray".to_owned();
+        Ok(RosTopic { topic: name.parse()?, type_name, deadline: None, lease: None })
+    };
+    let options = PublisherOptions { reliable: true, large: true, depth: 0 };
+    let publisher = network.publisher(&topic("big_reply")?, options)?;
+    let ask = SubscribeOptions { large: true, with_kept: true, ..SubscribeOptions::default() };
+    let mut subscription = network.subscribe(&topic("big")?, ask).await?;
+    let mut found = network.network();
+    let mut numbers = HashMap::<_, Numbers>::new();
+    let mut batch = Vec::new();
+    loop {
+        tokio::select! {
+            () = tokio::time::sleep_until(until) => break,
+            _ = found.changed() => {
+                let endpoints = Arc::clone(&found.borrow_and_update());
+                let writers = endpoints.endpoints.iter().filter(|it| it.is_writer);
+                network.set_owned(writers.map(|it| (it.id, true)).collect());
+            }
+            _ = subscription.receive(&mut batch, 64) => {
+                for received in batch.drain(..) {
+                    let Content::Frame(frame) = received.content else { continue };
+                    let numbers = numbers.entry(frame.origin_service().to_owned()).or_default();
+                    numbers.note(i64::try_from(frame.sequence())?);
+                    publisher.publish(&frame, None);
+                }
+            }
+        }
+    }
+    for it in &network.network().borrow().endpoints {
+        let node = it.node.as_deref().unwrap_or("?");
+        println!("{} {} of {node} ({})", it.name, it.dds_type, it.vendor.as_str());
+    }
+    for (service, numbers) in numbers {
+        print!("{service}: ");
+        numbers.print();
+    }
+    println!(
+        "{:?}, lost {}, {:?}",
+        network.counts(),
+        subscription.take_dropped(),
+        publisher.later()
+    );
+    network.close().await;
     Ok(())
 }

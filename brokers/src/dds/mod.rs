@@ -19,7 +19,7 @@ mod fault;
 mod filter;
 pub mod layer;
 mod nudge;
-mod participant;
+pub(crate) mod participant;
 mod pulse;
 mod reader;
 mod relay;

@@ -37,8 +37,10 @@ use tokio::sync::watch;
 
 use super::participant::Terms;
 use super::reader::StoppableThread;
-use super::{Cdr, DdsError, Endpoints, GuidPrefix, Participant, ParticipantConfig, Sample};
-use crate::outbox::{Admission, Body, LanePublisher};
+use super::{
+    Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Sample,
+};
+use crate::outbox::{Admission as OutboxAdmission, Body, LanePublisher};
 use crate::port::{
     BrokerError, BrokerStatus, Content, PublisherOptions, SubscribeOptions, Subscription,
 };
@@ -67,6 +69,8 @@ const LOOK: Duration = Duration::from_millis(5);
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) struct Topic {
     pub(crate) name: Arc<str>,
+    /// The topic as users name it.
+    pub(crate) user: Arc<str>,
     pub(crate) type_name: Arc<str>,
     pub(crate) terms: Terms,
 }
@@ -77,11 +81,19 @@ pub(crate) struct Encoded {
     pub(crate) options: WriteOptionsBuilder,
 }
 
+/// Whether samples of a writer are read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Admission {
+    Yes,
+    No,
+    /// It is not known yet: they wait, at most [`channel::LONGEST_DOUBT`].
+    Later,
+}
+
 /// What a sample is to those who read its topic.
 pub(crate) enum Decoded {
     Message(Content),
     /// It is for other readers.
-    #[allow(dead_code, reason = "of the adapter of ROS 2")]
     NotForUs,
     Malformed,
 }
@@ -101,6 +113,11 @@ pub(crate) trait Dialect: Send + Sync + 'static {
         now: Instant,
     ) -> Result<Box<dyn Companion>, DdsError>;
 
+    /// Whether writers of one topic may keep samples for late joiners, and others not.
+    fn mixes_durability(&self) -> bool {
+        false
+    }
+
     /// The topic on which participants of this kind tell that they live.
     fn sign_topic(&self) -> Option<&'static str> {
         None
@@ -108,6 +125,11 @@ pub(crate) trait Dialect: Send + Sync + 'static {
 
     /// All readers and writers that others have.
     fn note_endpoints(&self, endpoints: &Endpoints);
+
+    /// Whether samples of a writer are read. It may not have been found yet.
+    fn admission(&self, _writer: &EndpointId) -> Admission {
+        Admission::Yes
+    }
 
     /// What a sample of another participant holds, or what an own writer keeps.
     fn decode(&self, topic: &Topic, sample: &Sample) -> Decoded;
@@ -199,6 +221,11 @@ impl Adapter {
         Ok(())
     }
 
+    /// Samples that wait because it was not known whether they are read are looked at again.
+    pub(crate) fn look_again(&self) {
+        self.shared.channels.look_again();
+    }
+
     /// Writes a topic.
     pub(crate) fn publisher(
         &self,
@@ -277,7 +304,7 @@ impl Drop for Adapter {
 /// Writes one topic.
 pub(crate) type TopicPublisher = LanePublisher<Target, Arc<Shared>>;
 
-impl Admission for Arc<Shared> {
+impl OutboxAdmission for Arc<Shared> {
     fn is_shut(&self) -> bool {
         self.is_down()
     }
