@@ -12,6 +12,7 @@
 //! All on 127.0.0.1. Figures of runs against Fast DDS and Cyclone: `docs/design/ros2.md`.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -21,7 +22,7 @@ use blaze_brokers::dds::{
     Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer, Written,
 };
 use blaze_brokers::ros2::{GidLength, Ros2Config, Ros2Network, RosTopic};
-use blaze_brokers::{Content, Health, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{Content, Health, Publisher, PublisherOptions, SubscribeOptions};
 use bytes::{BufMut, BytesMut};
 use rustdds::WriteOptionsBuilder;
 use rustdds::rpc::SampleIdentity;
@@ -253,8 +254,11 @@ async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
         let type_name = "std_msgs/msg/UInt8MultiArray".to_owned();
         Ok(RosTopic { topic: name.parse()?, type_name, deadline: None, lease: None })
     };
-    let options = PublisherOptions { reliable: true, large: true, depth: 0 };
-    let publisher = network.publisher(&topic("big_reply")?, options)?;
+    let publisher = |depth| -> Result<Arc<dyn Publisher>, Error> {
+        let options = PublisherOptions { reliable: true, large: true, depth };
+        Ok(network.publisher(&topic("big_reply")?, options)?)
+    };
+    let mut publishers = HashMap::<u32, Arc<dyn Publisher>>::new();
     let ask = SubscribeOptions { large: true, with_kept: true, ..SubscribeOptions::default() };
     let mut subscription = network.subscribe(&topic("big")?, ask).await?;
     let mut found = network.network();
@@ -273,7 +277,11 @@ async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
                     let Content::Frame(frame) = received.content else { continue };
                     let numbers = numbers.entry(frame.origin_service().to_owned()).or_default();
                     numbers.note(i64::try_from(frame.sequence())?);
-                    publisher.publish(&frame, None);
+                    let depth = frame.depth();
+                    if let Entry::Vacant(vacant) = publishers.entry(depth) {
+                        vacant.insert(publisher(depth)?);
+                    }
+                    publishers[&depth].publish(&frame, None);
                 }
             }
         }
@@ -286,12 +294,10 @@ async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
         print!("{service}: ");
         numbers.print();
     }
-    println!(
-        "{:?}, lost {}, {:?}",
-        network.counts(),
-        subscription.take_dropped(),
-        publisher.later()
-    );
+    println!("{:?}, lost {}", network.counts(), subscription.take_dropped());
+    for (depth, publisher) in publishers {
+        println!("depth {depth}: {:?}", publisher.later());
+    }
     network.close().await;
     Ok(())
 }

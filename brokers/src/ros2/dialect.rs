@@ -92,7 +92,7 @@ impl Dialect for Ros {
         if writer.dds_type != *topic.type_name {
             return Decoded::NotForUs;
         }
-        let Some(type_name) = writer.type_name else { return Decoded::NotForUs };
+        let Some(type_name) = &writer.type_name else { return Decoded::NotForUs };
         let Ok(sequence) = u64::try_from(i64::from(sample.sequence_number)) else {
             return Decoded::Malformed;
         };
@@ -110,7 +110,7 @@ impl Dialect for Ros {
         };
         let header = Header {
             encoding: format!("application/cdr; type={type_name}"),
-            type_hash: writer.type_hash.unwrap_or_default(),
+            type_hash: writer.type_hash.clone().unwrap_or_default(),
             lifespan_ms: writer.lifespan.map_or(0, |lifespan| {
                 u32::try_from(lifespan.as_millis()).unwrap_or(u32::MAX).max(1)
             }),

@@ -24,16 +24,21 @@ const NODE_WAIT: Duration = Duration::from_millis(300);
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Network {
     /// By identity.
-    pub endpoints: Vec<RosEndpoint>,
+    pub endpoints: Vec<Arc<RosEndpoint>>,
     /// Endpoints beyond the limit.
     pub refused: usize,
     /// Participants that have them.
     pub participants: usize,
 }
 
+struct Entry {
+    endpoint: Arc<RosEndpoint>,
+    since: Instant,
+}
+
 #[derive(Default)]
 struct State {
-    endpoints: BTreeMap<EndpointId, (RosEndpoint, Instant)>,
+    endpoints: BTreeMap<EndpointId, Entry>,
     refused: usize,
     /// Endpoints of flows.
     marked: HashSet<EndpointId>,
@@ -61,28 +66,23 @@ impl Knowledge {
     /// Takes over what discovery has found.
     pub(super) fn note_endpoints(&self, now: Instant, found: &Endpoints) {
         let mut state = self.state.lock();
+        let alive: HashSet<GuidPrefix> =
+            found.writers.iter().chain(&found.readers).map(FoundEndpoint::participant).collect();
+        state.nodes.retain(|participant, _| alive.contains(participant));
         state.marked.clear();
         state.refused = 0;
-        let mut endpoints = BTreeMap::new();
+        let mut known = std::mem::take(&mut state.endpoints);
         for (all, is_writer) in [(&found.writers, true), (&found.readers, false)] {
             for one in all {
                 if one.is_marked() {
                     state.marked.insert(one.id);
-                } else if let Some(entry) = state.entry(now, one, is_writer) {
-                    if endpoints.len() < MAX_ENDPOINTS {
-                        endpoints.insert(one.id, entry);
-                    } else {
-                        state.refused += 1;
-                    }
+                } else if let Some(endpoint) = RosEndpoint::of(one, is_writer) {
+                    state.put(known.remove(&one.id), endpoint, now);
                 }
             }
         }
-        state.endpoints = endpoints;
-        let State { endpoints, nodes, owned, .. } = &mut *state;
+        let State { endpoints, owned, .. } = &mut *state;
         owned.retain(|id, _| endpoints.contains_key(id));
-        let alive: HashSet<GuidPrefix> =
-            found.writers.iter().chain(&found.readers).map(FoundEndpoint::participant).collect();
-        nodes.retain(|participant, _| alive.contains(participant));
         self.publish(&state, now);
     }
 
@@ -92,7 +92,15 @@ impl Knowledge {
         if state.nodes.len() >= MAX_PARTICIPANTS && !state.nodes.contains_key(&from) {
             return;
         }
-        state.nodes.insert(from, told.owners());
+        let owners = told.owners();
+        let State { endpoints, nodes, .. } = &mut *state;
+        for (id, entry) in endpoints.iter_mut().filter(|(id, _)| id[..12] == from.0) {
+            let node = owners.get(id);
+            if entry.endpoint.node.as_ref() != node {
+                Arc::make_mut(&mut entry.endpoint).node = node.cloned();
+            }
+        }
+        nodes.insert(from, owners);
         self.publish(&state, now);
     }
 
@@ -118,27 +126,24 @@ impl Knowledge {
     }
 
     /// What is known of a writer.
-    pub(super) fn writer(&self, id: &EndpointId) -> Option<RosEndpoint> {
-        let state = self.state.lock();
-        let (endpoint, _) = state.endpoints.get(id)?;
-        Some(state.with_node(endpoint))
+    pub(super) fn writer(&self, id: &EndpointId) -> Option<Arc<RosEndpoint>> {
+        self.state.lock().endpoints.get(id).map(|entry| Arc::clone(&entry.endpoint))
     }
 
     fn publish(&self, state: &State, now: Instant) {
-        let counts = |(endpoint, found): &(RosEndpoint, Instant)| {
-            let endpoint = state.with_node(endpoint);
-            let waited = now.saturating_duration_since(*found) >= NODE_WAIT;
-            (endpoint.node.is_some() || waited).then_some(endpoint)
+        let counts = |entry: &&Entry| {
+            entry.endpoint.node.is_some() || now.saturating_duration_since(entry.since) >= NODE_WAIT
         };
-        let endpoints: Vec<RosEndpoint> = state.endpoints.values().filter_map(counts).collect();
+        let endpoints: Vec<Arc<RosEndpoint>> = state
+            .endpoints
+            .values()
+            .filter(counts)
+            .map(|entry| Arc::clone(&entry.endpoint))
+            .collect();
         let participants: HashSet<&[u8]> = endpoints.iter().map(|it| &it.id[..12]).collect();
-        let network = Network {
-            participants: participants.len(),
-            refused: state.refused,
-            endpoints: Vec::new(),
-        };
+        let participants = participants.len();
+        let network = Network { endpoints, refused: state.refused, participants };
         self.network.send_if_modified(|known| {
-            let network = Network { endpoints, ..network };
             let is_new = **known != network;
             if is_new {
                 *known = Arc::new(network);
@@ -149,23 +154,23 @@ impl Knowledge {
 }
 
 impl State {
-    /// What was found, and when it was first.
-    fn entry(
-        &self,
-        now: Instant,
-        found: &FoundEndpoint,
-        is_writer: bool,
-    ) -> Option<(RosEndpoint, Instant)> {
-        let since = self.endpoints.get(&found.id).map_or(now, |(_, since)| *since);
-        Some((RosEndpoint::of(found, is_writer)?, since))
-    }
-
-    fn with_node(&self, endpoint: &RosEndpoint) -> RosEndpoint {
+    /// Puts in what was found, with its node and when it was found first.
+    fn put(&mut self, known: Option<Entry>, mut endpoint: RosEndpoint, now: Instant) {
+        if self.endpoints.len() >= MAX_ENDPOINTS {
+            self.refused += 1;
+            return;
+        }
         let mut participant = GuidPrefix([0; 12]);
         participant.0.copy_from_slice(&endpoint.id[..12]);
         let nodes = self.nodes.get(&participant);
-        let node = nodes.and_then(|nodes| nodes.get(&endpoint.id)).cloned();
-        RosEndpoint { node, ..endpoint.clone() }
+        endpoint.node = nodes.and_then(|nodes| nodes.get(&endpoint.id)).cloned();
+        let since = known.as_ref().map_or(now, |entry| entry.since);
+        // What has not changed stays the same, which is quick to compare.
+        let endpoint = match known {
+            Some(entry) if *entry.endpoint == endpoint => entry.endpoint,
+            _ => Arc::new(endpoint),
+        };
+        self.endpoints.insert(endpoint.id, Entry { endpoint, since });
     }
 }
 
