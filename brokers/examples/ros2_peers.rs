@@ -245,6 +245,7 @@ async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
         domain,
         interface: Ipv4Addr::LOCALHOST,
         namespace: String::new(),
+        peers: Vec::new(),
         gid: GidLength::Short,
     })?;
     let until = tokio::time::Instant::now() + time;

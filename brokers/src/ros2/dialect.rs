@@ -15,7 +15,7 @@ use crate::dds::adapter::{Admission, Companion, Decoded, Dialect, Encoded, Other
 use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
-    Sample, Terms, Writer,
+    Relay, Sample, Terms, Writer,
 };
 use crate::outbox::Body;
 use crate::port::Content;
@@ -36,6 +36,8 @@ pub(super) struct Ros {
     pub(super) flow: FlowId,
     pub(super) gid: GidLength,
     pub(super) knowledge: Arc<Knowledge>,
+    /// Announces the participant to peers, and to those of this host that RustDDS leaves out.
+    pub(super) relay: Relay,
 }
 
 impl Dialect for Ros {
@@ -55,6 +57,7 @@ impl Dialect for Ros {
         participant: &Participant,
         _: Instant,
     ) -> Result<Box<dyn Companion>, DdsError> {
+        self.relay.set_participant(participant.prefix());
         let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,

@@ -26,7 +26,7 @@ use tokio::sync::watch;
 
 use crate::dds::adapter::{Adapter, Topic};
 use crate::dds::layer::DdsCounts;
-use crate::dds::{DdsError, EndpointId, Terms};
+use crate::dds::{DdsError, EndpointId, Relay, RelayConfig, SLOTS, Terms};
 use crate::port::{
     BrokerError, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions, Subscription,
 };
@@ -50,9 +50,16 @@ pub struct Ros2Config {
     pub interface: Ipv4Addr,
     /// Stands before ROS 2 names in topics; may be empty.
     pub namespace: String,
+    /// Hosts that multicast does not reach.
+    pub peers: Vec<Ipv4Addr>,
     /// Length of gids in the graph.
     pub gid: GidLength,
 }
+
+/// Participants of one peer that are announced to, as other implementations do.
+const PEER_SLOTS: u16 = 32;
+/// Time between two announcements to the same participant.
+const ANNOUNCE: Duration = Duration::from_secs(2);
 
 /// What a topic is on the network.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -83,7 +90,17 @@ impl Ros2Network {
     pub fn open(config: Ros2Config) -> Result<Self, DdsError> {
         crate::dds::check(config.domain, IpAddr::V4(config.interface))?;
         let knowledge = Arc::new(Knowledge::new());
-        let ros = Ros { flow: config.flow, gid: config.gid, knowledge: Arc::clone(&knowledge) };
+        let relay = Relay::start(RelayConfig {
+            domain: config.domain,
+            address: config.interface,
+            peers: config.peers.iter().map(Ipv4Addr::to_string).collect(),
+            slots: PEER_SLOTS,
+            own_slots: SLOTS,
+            holds_multicast: false,
+            repeat: ANNOUNCE,
+        })?;
+        let ros =
+            Ros { flow: config.flow, gid: config.gid, knowledge: Arc::clone(&knowledge), relay };
         let adapter = Adapter::open(Arc::new(ros), config.domain, config.interface)?;
         Ok(Self { adapter, knowledge, namespace: config.namespace })
     }
