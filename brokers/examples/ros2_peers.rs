@@ -3,8 +3,8 @@
 //! ```text
 //! ros2_peers DOMAIN echo SECONDS      rt/big -> rt/big_reply, as raw CDR; gaps, doubles, what the kernel dropped
 //! ros2_peers DOMAIN late SECONDS      joins rt/counter as a reliable, volatile reader; the first and last sample, gaps
-//! ros2_peers DOMAIN serve SECONDS     answers rq/add_two_intsRequest, with the identity of the request in the reply
-//! ros2_peers DOMAIN call COUNT        calls rq/add_two_intsRequest and looks for its identity in the replies
+//! ros2_peers DOMAIN serve SECONDS     answers rq/basic_typesRequest, with the identity of the request in the reply
+//! ros2_peers DOMAIN call COUNT        calls rq/basic_typesRequest and looks for its identity in the replies
 //! ros2_peers DOMAIN watch SECONDS     prints the endpoints of others
 //! ros2_peers DOMAIN adapter SECONDS   rt/big -> rt/big_reply through the adapter, and prints what it knows of others
 //! ```
@@ -14,7 +14,6 @@
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::net::Ipv4Addr;
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
@@ -179,7 +178,7 @@ fn call(participant: &Participant, count: u64) -> Result<(), Error> {
     let reply = ("rr/basic_typesReply", REPLY);
     let (_reader, samples) = read(participant, reply, reliable(64))?;
     let request = ("rq/basic_typesRequest", REQUEST);
-    let writer = Arc::new(participant.typed_writer(request, reliable(64))?);
+    let writer = participant.typed_writer(request, reliable(64))?;
     // One member of each kind: a request and a reply of test_msgs/srv/BasicTypes end in a string.
     let mut cdr = BytesMut::from(&[0, 1, 0, 0][..]);
     cdr.put_bytes(0, 48);

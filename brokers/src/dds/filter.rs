@@ -1,10 +1,10 @@
 //! A packet filter in the kernel (classic BPF) that keeps datagrams from RustDDS 0.15 which make it
-//! allocate without bound, stand still or panic, and which no implementation sends:
+//! allocate without bound, stand still or panic:
 //!
 //! | submessage | dropped when |
 //! |---|---|
 //! | DATA_FRAG | the sample is larger than any that is expected, the fragment size is not RustDDS' own (of other implementations: below 256 bytes), the fragment number or count is 0 |
-//! | HEARTBEAT, GAP | the range is wider than any that writers send, ends more than one before its begin, or crosses a multiple of 2³² |
+//! | HEARTBEAT, GAP | the range is wider than any that writers send, ends more than one before its begin, or crosses a multiple of 2³²; a GAP from 1 on may have any range |
 //! | ACKNACK, NACK_FRAG, HEARTBEAT_FRAG | the bitmap or fragment number is beyond all that is sent for the samples of the topics |
 //! | all of these | a sequence number is negative, or 2⁴⁷ or more |
 //!
@@ -12,9 +12,8 @@
 //! submessages is unrolled, since a filter has no loops, so datagrams with more submessages than
 //! there are steps are dropped, too. A *full* step knows all kinds. A *quick* step takes DATA and
 //! INFO_TS in little endian, of which many are packed into one datagram; at anything else it leaves
-//! to the packed steps. A *packed* step takes what other implementations than RustDDS pack, too:
-//! INFO_DST, HEARTBEAT, ACKNACK, NACK_FRAG and GAP; at anything else it leaves to the last full
-//! steps.
+//! to the packed steps. A *packed* step knows all kinds in little endian that implementations are
+//! known to send; at anything else it leaves to the last full steps.
 
 mod assembler;
 mod program;

@@ -108,6 +108,14 @@ fn mark() -> Duration {
     Duration::from_secs(MARK_SECONDS) + Duration::from_secs(5) / (1 << 32)
 }
 
+/// As RTPS has it: from 68 years on without end.
+fn duration(time: time::Duration) -> Duration {
+    match i32::try_from(time.as_secs()) {
+        Ok(seconds) if seconds < i32::MAX => Duration::from_std(time),
+        _ => Duration::INFINITE,
+    }
+}
+
 /// Whether a Lifespan is the mark. It may have been rounded.
 pub(super) fn is_mark(lifespan: Duration) -> bool {
     let difference = lifespan.to_nanoseconds() - mark().to_nanoseconds();
@@ -128,11 +136,11 @@ pub struct Profile {
     /// not by others; at least `depth`. RustDDS keeps them, and those of the last six seconds, in
     /// memory.
     pub window: u16,
-    /// What is rarely said.
+    /// Deadline, lease of liveliness, mark of flows.
     pub terms: Terms,
 }
 
-/// The rarer terms of a writer or reader.
+/// Deadline, lease of liveliness and mark of a writer or reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Terms {
     /// Whether it is marked as an endpoint of a flow, for other flows.
@@ -164,10 +172,10 @@ impl Profile {
                 max_samples_per_instance: samples,
             });
         if let Some(deadline) = self.terms.deadline {
-            builder = builder.deadline(Deadline(Duration::from_std(deadline)));
+            builder = builder.deadline(Deadline(duration(deadline)));
         }
         if let Some(lease) = self.terms.lease {
-            let lease_duration = Duration::from_std(lease);
+            let lease_duration = duration(lease);
             builder = builder.liveliness(Liveliness::Automatic { lease_duration });
         }
         if self.terms.marked {
@@ -358,7 +366,7 @@ impl Participant {
         super::fault::inject(self, fault)
     }
 
-    /// Makes a reader of a topic, given with its type; whoever has it empties it.
+    /// Makes a reader of a topic, given with its type. It has no thread that empties it.
     pub(crate) fn raw_reader(
         &self,
         topic: (&str, &str),
@@ -410,9 +418,7 @@ impl Participant {
 fn weakness(filter: &Result<Attached, FilterError>) -> Option<String> {
     match filter {
         Ok(attached) if !attached.is_small => None,
-        Ok(_) => Some(
-            "the packet filter is a small one, since net.core.optmem_max is below 61440".into(),
-        ),
+        Ok(_) => Some("the packet filter is a small one: set net.core.optmem_max to 131072".into()),
         Err(error) => {
             Some(format!("no packet filter, so any sender can exhaust the memory: {error}"))
         }

@@ -134,13 +134,17 @@ impl no_key::SerializerAdapter<Cdr> for CdrAdapter {
         RepresentationIdentifier::CDR_LE
     }
     fn to_bytes(sample: &Cdr) -> io::Result<Bytes> {
-        Ok(sample.0.slice(ENCAPSULATION..))
+        if sample.encoding() != LITTLE[..2] {
+            return Err(io::Error::new(io::ErrorKind::InvalidData, "not little-endian CDR"));
+        }
+        Ok(sample.0.slice_ref(sample.body()))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rustdds::no_key::SerializerAdapter as _;
 
     fn of(payload: &[u8]) -> Cdr {
         Cdr(Bytes::copy_from_slice(payload))
@@ -170,6 +174,8 @@ mod tests {
         assert!(little(b"\0\x01\0\0") && little(b"\0\x01\0\x03abc\0"));
         for other in [&b""[..], b"\0\x01\0", b"\0\0\0\0", b"\0\x07\0\0abcd"] {
             assert!(!little(other), "{other:?}");
+            let written = CdrAdapter::to_bytes(&of(other));
+            assert!(written.is_err() || other.starts_with(b"\0\x01"), "{other:?}");
         }
     }
 }

@@ -37,7 +37,7 @@ pub struct FoundEndpoint {
     pub type_name: String,
     /// What it offers or asks for.
     pub qos: QosPolicies,
-    /// What its application says with it.
+    /// QoS USER_DATA.
     pub user_data: Vec<u8>,
     /// Where it takes data or acknowledgements; empty where it does so at no UDP address.
     pub sockets: Vec<SocketAddr>,

@@ -20,7 +20,6 @@ use blaze_domain::Priority;
 use blaze_domain::node_file::Chunking;
 use blaze_flow::link::dds::{DdsConfig, DdsTransport};
 use blaze_flow::link::transport::{Endpoint, SendOutcome, TransportEvent};
-use bytes::Bytes;
 use clap::Args;
 use parking_lot::Mutex;
 

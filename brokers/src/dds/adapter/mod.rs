@@ -153,7 +153,7 @@ pub(crate) trait Companion: Send {
 /// What a broker has counted since it was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct DdsCounts {
-    /// Samples that were malformed.
+    /// Samples that were malformed, each once, and not those from before its topic was read.
     pub malformed: u64,
     /// How often RustDDS died and was built anew.
     pub rebuilds: u64,
@@ -203,13 +203,18 @@ impl Adapter {
         self.shared.wake_lifecycle();
     }
 
-    /// Why nothing can be read or written now, if so.
-    pub(crate) fn check_up(&self) -> Result<(), BrokerError> {
+    /// Whether topics can be read and written now.
+    fn check_up(&self) -> Result<(), BrokerError> {
         self.check_open()?;
         if self.shared.is_up() { Ok(()) } else { Err(self.shared.away()) }
     }
 
-    /// Why nothing can be written or read now.
+    /// Whether the participant stands. While it closes it still writes.
+    pub(crate) fn is_up(&self) -> bool {
+        self.shared.is_up()
+    }
+
+    /// The error of one that does not stand.
     pub(crate) fn away(&self) -> BrokerError {
         self.shared.away()
     }

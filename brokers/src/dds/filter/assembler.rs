@@ -64,8 +64,6 @@ pub(super) enum Test {
     AnyBit = 0x45,
     /// A == X
     EqualsIndex = 0x1d,
-    /// A > k (unsigned)
-    Above = 0x25,
     /// A > X (unsigned)
     AboveIndex = 0x2d,
 }

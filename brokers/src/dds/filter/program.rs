@@ -4,24 +4,19 @@
 //! drops the packet; RustDDS refuses such a datagram as a whole, too.
 
 use super::assembler::{Assembler, Instruction, Op, Test};
-use super::steps::{
-    DROP, HEARTBEAT_RANGE, Limits, full_step, packed_step, pass_at_end, quick_step,
-};
+use super::steps::{DROP, Limits, full_step, packed_step, pass_at_end, quick_step};
 
 const UDP_HEADER: u32 = 8;
 const RTPS_HEADER: u32 = 20;
 const MAGIC: u32 = u32::from_be_bytes(*b"RTPS");
 
-/// RustDDS cuts samples into fragments of this many bytes. Nobody sends smaller ones.
+/// RustDDS cuts samples into fragments of this many bytes. Smaller ones are not taken of anybody.
 const FRAGMENT: u32 = 256;
 /// First fragment that a NACK_FRAG may ask for where only samples of discovery are repaired, which
 /// have less than one packet. RustDDS allocates a bit for each fragment before it.
 const MAX_NACK_FRAGMENT: u32 = 0x3ff;
 /// Last fragment of a HEARTBEAT_FRAG, at least.
 const MAX_FRAGMENT: u32 = 0xffff;
-/// Width of a GAP of RustDDS: up to 2¹⁷ numbers. It sends the 8,192 of a writer.
-const GAP_RANGE: u32 = 1;
-
 /// How many steps a filter has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Shape {
@@ -36,7 +31,7 @@ pub(super) struct Shape {
 }
 
 impl Shape {
-    /// 3,576 of 4,096 possible instructions: enough for all that RustDDS packs into 9000 bytes, and
+    /// 3,592 of 4,096 possible instructions: enough for all that RustDDS packs into 9000 bytes, and
     /// on loopback (65,536) for the 128 samples that may wait in a writer of 32 KiB samples.
     const LARGE: Self = Self { first: 4, quick: 160, packed: 0, last: 4 };
     /// What fits into the 20 KiB that a socket has for its options where `net.core.optmem_max` has
@@ -45,9 +40,9 @@ impl Shape {
     const SMALL: Self = Self { first: 2, quick: 24, packed: 0, last: 2 };
     /// For other implementations: Cyclone packs some 60 announcements, each with its time, into one
     /// datagram, and heartbeats and acknowledgements of many endpoints. Fast DDS ends a datagram
-    /// with a fragment by a heartbeat and a submessage of its own. 3,997 instructions.
-    const LARGE_ANY_VENDOR: Self = Self { first: 1, quick: 115, packed: 28, last: 3 };
-    const SMALL_ANY_VENDOR: Self = Self { first: 1, quick: 17, packed: 4, last: 2 };
+    /// with a fragment by a heartbeat and a submessage of its own. 4,070 instructions.
+    const LARGE_ANY_VENDOR: Self = Self { first: 1, quick: 118, packed: 22, last: 2 };
+    const SMALL_ANY_VENDOR: Self = Self { first: 2, quick: 16, packed: 3, last: 1 };
 
     /// The large and the small shape for samples.
     pub(super) fn both(samples: Samples) -> [Self; 2] {
@@ -81,7 +76,6 @@ impl Samples {
             nack_fragment: !nack,
             fragment: !fragments.max(MAX_FRAGMENT),
             exact_fragment: (!self.any_vendor).then_some(FRAGMENT),
-            gap_range: if self.any_vendor { HEARTBEAT_RANGE } else { GAP_RANGE },
         }
     }
 }

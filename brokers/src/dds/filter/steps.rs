@@ -25,11 +25,15 @@ const LITTLE: u32 = 0x0001_0000;
 /// Bits of a bitmap. RustDDS takes 256 and no more; this only is the next power of two.
 const MAX_BITS: u32 = 0x1ff;
 /// Bits that the upper word of a sequence number must not have: numbers below 2⁴⁷ pass, which a
-/// writer reaches in 4,000 years of 1,000 samples a second.
+/// writer reaches in 4,000 years at 1 kHz.
 const UPPER_WORD: u32 = 0xffff_8000;
 /// Width of a HEARTBEAT's range in units of 65,536: up to 2²⁰ numbers, which RustDDS lists with 8
 /// bytes each.
-pub(super) const HEARTBEAT_RANGE: u32 = 15;
+const HEARTBEAT_RANGE: u32 = 15;
+/// Width of a GAP's range: up to 2¹⁷ numbers, of which RustDDS makes a map. It itself sends the
+/// 8,192 of a writer, others some ten. One from 1 on may have any: of it RustDDS only notes where
+/// it ends.
+const GAP_RANGE: u32 = 1;
 
 // Words of memory.
 /// First word of the submessage: kind, flags, length.
@@ -50,9 +54,6 @@ pub(super) struct Limits {
     pub(super) fragment: u32,
     /// Bytes of a fragment; `None`: 256 or more.
     pub(super) exact_fragment: Option<u32>,
-    /// Width of a GAP's range in units of 65,536; RustDDS makes a map of its numbers. One from 1 on
-    /// may have any: of it RustDDS only notes where it ends.
-    pub(super) gap_range: u32,
 }
 
 /// Passes the packet when X has reached its end.
@@ -100,197 +101,217 @@ pub(super) fn quick_step(asm: &mut Assembler, other: Label) {
     skip_little(asm);
 }
 
-/// Looks at one little-endian submessage of the kinds that others than RustDDS pack into one
-/// datagram. A GAP may be as wide as a HEARTBEAT.
+/// Looks at one little-endian submessage of any kind that implementations are known to send.
 pub(super) fn packed_step(asm: &mut Assembler, limits: Limits, other: Label) {
     pass_at_end(asm);
-    let [gap, range, acknack, nack_frag, numbered, known, bad, next] =
-        [(); 8].map(|()| asm.label());
+    let labels = Labels::new(asm);
+    asm.op(Op::StoreIndex, POSITION);
     asm.op(Op::LoadWord, 0);
     asm.op(Op::And, 0xff00_0000 | LITTLE);
-    asm.when(Test::Equal, DATA << 24 | LITTLE, known);
-    asm.when(Test::Equal, INFO_TS << 24 | LITTLE, known);
-    asm.when(Test::Equal, INFO_DST << 24 | LITTLE, known);
-    asm.when(Test::Equal, HEARTBEAT << 24 | LITTLE, range);
-    asm.when(Test::Equal, ACKNACK << 24 | LITTLE, acknack);
-    asm.when(Test::Equal, GAP << 24 | LITTLE, gap);
-    asm.when(Test::Equal, NACK_FRAG << 24 | LITTLE, nack_frag);
-    asm.when(Test::Equal, FAST_DDS << 24 | LITTLE, known);
+    for kind in [DATA, INFO_TS, INFO_DST, FAST_DDS] {
+        asm.when(Test::Equal, kind << 24 | LITTLE, labels.good);
+    }
+    for (kind, label) in labels.kinds() {
+        asm.when(Test::Equal, kind << 24 | LITTLE, label);
+    }
     asm.jump(other);
-
-    asm.place(nack_frag);
-    not_zero(asm, 20, bad);
-    asm.when(Test::AnyBit, limits.nack_fragment.swap_bytes(), bad);
-    asm.op(Op::LoadWord, 24);
-    asm.when(Test::AnyBit, (!MAX_BITS).swap_bytes(), bad);
-    asm.jump(numbered);
-
-    asm.place(acknack);
-    asm.op(Op::LoadWord, 20);
-    asm.when(Test::AnyBit, (!MAX_BITS).swap_bytes(), bad);
-    asm.jump(numbered);
-
-    asm.place(gap);
-    asm.op(Op::LoadWord, 16);
-    asm.unless(Test::Equal, 1_u32.swap_bytes(), range);
-    asm.op(Op::LoadWord, 20);
-    asm.when(Test::AnyBit, UPPER_WORD.swap_bytes(), bad);
-    asm.jump(numbered);
-
-    asm.place(range);
-    asm.op(Op::StoreIndex, POSITION);
-    same_upper_word(asm, bad);
-    little_halves(asm);
-    asm.op(Op::Add, 1);
-    asm.op(Op::RecallIndex, FIRST);
-    asm.op(Op::SubtractIndex, 0);
-    asm.op(Op::RecallIndex, POSITION);
-    asm.when(Test::Above, HEARTBEAT_RANGE + 1, bad);
-
-    asm.place(numbered);
-    asm.op(Op::LoadWord, 12);
-    asm.when(Test::AnyBit, UPPER_WORD.swap_bytes(), bad);
-    asm.place(known);
+    check_kinds(asm, limits, ByteOrder::Little, &labels);
     skip_little(asm);
-    asm.jump(next);
-    asm.place(bad);
-    asm.op(Op::Return, DROP);
-    asm.place(next);
+    labels.end(asm);
 }
 
 /// Looks at one submessage of any kind.
 pub(super) fn full_step(asm: &mut Assembler, limits: Limits) {
     pass_at_end(asm);
-    let [data_frag, heartbeat, gap, acknack, nack_frag, heartbeat_frag] =
-        [(); 6].map(|()| asm.label());
-    let [range, from_one, numbered, good, bad, next] = [(); 6].map(|()| asm.label());
+    let labels = Labels::new(asm);
     asm.op(Op::StoreIndex, POSITION);
     asm.op(Op::LoadWord, 0);
     asm.op(Op::Store, HEAD);
     asm.op(Op::ShiftRight, 24);
-    asm.when(Test::Equal, DATA_FRAG, data_frag);
-    asm.when(Test::Equal, HEARTBEAT, heartbeat);
-    asm.when(Test::Equal, GAP, gap);
-    asm.when(Test::Equal, ACKNACK, acknack);
-    asm.when(Test::Equal, NACK_FRAG, nack_frag);
-    asm.when(Test::Equal, HEARTBEAT_FRAG, heartbeat_frag);
-    asm.jump(good);
-
-    asm.place(data_frag);
-    no_bits(asm, 16, UPPER_WORD, bad);
-    not_zero(asm, 24, bad);
-    fragment_shape(asm, limits.exact_fragment, bad);
-    no_bits(asm, 32, limits.sample, bad);
-    asm.jump(good);
-
-    asm.place(acknack);
-    no_bits(asm, 20, !MAX_BITS, bad);
-    asm.jump(numbered);
-
-    asm.place(nack_frag);
-    not_zero(asm, 20, bad);
-    no_bits(asm, 20, limits.nack_fragment, bad);
-    no_bits(asm, 24, !MAX_BITS, bad);
-    asm.jump(numbered);
-
-    asm.place(heartbeat_frag);
-    no_bits(asm, 20, limits.fragment, bad);
-    asm.jump(numbered);
-
-    asm.place(gap);
-    is_from_one(asm, from_one);
-    asm.op(Op::LoadConstant, limits.gap_range + 1);
-    asm.jump(range);
-    asm.place(from_one);
-    no_bits(asm, 20, UPPER_WORD, bad);
-    asm.jump(numbered);
-    asm.place(heartbeat);
-    asm.op(Op::LoadConstant, HEARTBEAT_RANGE + 1);
-    asm.place(range);
-    check_range(asm, bad);
-
-    asm.place(numbered);
-    no_bits(asm, 12, UPPER_WORD, bad);
-    asm.place(good);
+    for (kind, label) in labels.kinds() {
+        asm.when(Test::Equal, kind, label);
+    }
+    asm.jump(labels.good);
+    check_kinds(asm, limits, ByteOrder::Any, &labels);
     skip_body(asm);
-    asm.jump(next);
-    asm.place(bad);
-    asm.op(Op::Return, DROP);
-    asm.place(next);
+    labels.end(asm);
 }
 
-/// The word at an offset must not be 0, whatever the endianness.
+/// Of which byte order a submessage may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum ByteOrder {
+    Little,
+    /// As its first word in memory says.
+    Any,
+}
+
+/// Where a step goes on for the kinds that it looks at, and at its end.
+struct Labels {
+    data_frag: Label,
+    heartbeat: Label,
+    gap: Label,
+    acknack: Label,
+    nack_frag: Label,
+    heartbeat_frag: Label,
+    good: Label,
+    bad: Label,
+    next: Label,
+}
+
+impl Labels {
+    fn new(asm: &mut Assembler) -> Self {
+        let [data_frag, heartbeat, gap, acknack, nack_frag, heartbeat_frag, good, bad, next] =
+            [(); 9].map(|()| asm.label());
+        Self { data_frag, heartbeat, gap, acknack, nack_frag, heartbeat_frag, good, bad, next }
+    }
+
+    fn kinds(&self) -> [(u32, Label); 6] {
+        [
+            (HEARTBEAT, self.heartbeat),
+            (ACKNACK, self.acknack),
+            (DATA_FRAG, self.data_frag),
+            (GAP, self.gap),
+            (NACK_FRAG, self.nack_frag),
+            (HEARTBEAT_FRAG, self.heartbeat_frag),
+        ]
+    }
+
+    fn end(&self, asm: &mut Assembler) {
+        asm.jump(self.next);
+        asm.place(self.bad);
+        asm.op(Op::Return, DROP);
+        asm.place(self.next);
+    }
+}
+
+/// Checks a submessage of each kind; ends where what is good goes on.
+fn check_kinds(asm: &mut Assembler, limits: Limits, order: ByteOrder, labels: &Labels) {
+    let [range, gap_range, from_one, numbered] = [(); 4].map(|()| asm.label());
+    let bad = labels.bad;
+    asm.place(labels.data_frag);
+    no_bits(asm, order, 16, UPPER_WORD, bad);
+    not_zero(asm, 24, bad);
+    fragment_shape(asm, order, limits.exact_fragment, bad);
+    no_bits(asm, order, 32, limits.sample, bad);
+    asm.jump(labels.good);
+
+    asm.place(labels.acknack);
+    no_bits(asm, order, 20, !MAX_BITS, bad);
+    asm.jump(numbered);
+
+    asm.place(labels.nack_frag);
+    not_zero(asm, 20, bad);
+    no_bits(asm, order, 20, limits.nack_fragment, bad);
+    no_bits(asm, order, 24, !MAX_BITS, bad);
+    asm.jump(numbered);
+
+    asm.place(labels.heartbeat_frag);
+    no_bits(asm, order, 20, limits.fragment, bad);
+    asm.jump(numbered);
+
+    asm.place(labels.gap);
+    // A number is two words, the upper one first; 1 is 0 and 1.
+    asm.op(Op::LoadWord, 12);
+    asm.unless(Test::Equal, 0, gap_range);
+    is_one(asm, order, 16, from_one);
+    asm.place(gap_range);
+    asm.op(Op::LoadConstant, GAP_RANGE + 1);
+    asm.jump(range);
+    asm.place(from_one);
+    no_bits(asm, order, 20, UPPER_WORD, bad);
+    asm.jump(numbered);
+    asm.place(labels.heartbeat);
+    asm.op(Op::LoadConstant, HEARTBEAT_RANGE + 1);
+    asm.place(range);
+    check_range(asm, order, bad);
+
+    asm.place(numbered);
+    no_bits(asm, order, 12, UPPER_WORD, bad);
+    asm.place(labels.good);
+}
+
+/// The word at an offset must not be 0, whatever the byte order.
 fn not_zero(asm: &mut Assembler, offset: u32, bad: Label) {
     asm.op(Op::LoadWord, offset);
     asm.when(Test::Equal, 0, bad);
 }
 
-/// None of some bits may be set in the word at an offset.
-fn no_bits(asm: &mut Assembler, offset: u32, bits: u32, bad: Label) {
+/// Emits what is to be done in big and in little endian.
+fn by_order(asm: &mut Assembler, order: ByteOrder, emit: impl Fn(&mut Assembler, ByteOrder)) {
+    if order == ByteOrder::Little {
+        emit(asm, order);
+        return;
+    }
     let [little, done] = [(); 2].map(|()| asm.label());
     asm.op(Op::Recall, HEAD);
     asm.when(Test::AnyBit, LITTLE, little);
-    asm.op(Op::LoadWord, offset);
-    asm.when(Test::AnyBit, bits, bad);
+    emit(asm, ByteOrder::Any);
     asm.jump(done);
     asm.place(little);
-    asm.op(Op::LoadWord, offset);
-    asm.when(Test::AnyBit, bits.swap_bytes(), bad);
+    emit(asm, ByteOrder::Little);
     asm.place(done);
 }
 
-/// The number of fragments in a DATA_FRAG is not 0, and their size is the exact one, or at least 256.
-fn fragment_shape(asm: &mut Assembler, exact: Option<u32>, bad: Label) {
-    let [little, done] = [(); 2].map(|()| asm.label());
+/// The word of a submessage as the big-endian machine loads it.
+fn word(order: ByteOrder, value: u32) -> u32 {
+    if order == ByteOrder::Little { value.swap_bytes() } else { value }
+}
+
+/// None of some bits may be set in the word at an offset.
+fn no_bits(asm: &mut Assembler, order: ByteOrder, offset: u32, bits: u32, bad: Label) {
+    by_order(asm, order, |asm, order| {
+        asm.op(Op::LoadWord, offset);
+        asm.when(Test::AnyBit, word(order, bits), bad);
+    });
+}
+
+/// Goes on at `one` when the word at an offset is 1.
+fn is_one(asm: &mut Assembler, order: ByteOrder, offset: u32, one: Label) {
+    by_order(asm, order, |asm, order| {
+        asm.op(Op::LoadWord, offset);
+        asm.when(Test::Equal, word(order, 1), one);
+    });
+}
+
+/// The number of fragments in a DATA_FRAG is not 0, and their size is the exact one, or at least
+/// 256 bytes.
+fn fragment_shape(asm: &mut Assembler, order: ByteOrder, exact: Option<u32>, bad: Label) {
     asm.op(Op::LoadHalf, 28);
     asm.when(Test::Equal, 0, bad);
-    asm.op(Op::Recall, HEAD);
-    asm.when(Test::AnyBit, LITTLE, little);
-    asm.op(Op::LoadHalf, 30);
-    match exact {
-        Some(bytes) => asm.unless(Test::Equal, bytes, bad),
-        None => asm.unless(Test::AnyBit, 0xff00, bad),
-    }
-    asm.jump(done);
-    asm.place(little);
-    asm.op(Op::LoadHalf, 30);
-    match exact {
-        Some(bytes) => asm.unless(Test::Equal, bytes.swap_bytes() >> 16, bad),
-        None => asm.unless(Test::AnyBit, 0x00ff, bad),
-    }
-    asm.place(done);
-}
-
-/// Goes on at `from_one` when the lower word of the sequence number at 12 is 1.
-fn is_from_one(asm: &mut Assembler, from_one: Label) {
-    let [little, done] = [(); 2].map(|()| asm.label());
-    asm.op(Op::Recall, HEAD);
-    asm.when(Test::AnyBit, LITTLE, little);
-    asm.op(Op::LoadWord, 16);
-    asm.when(Test::Equal, 1, from_one);
-    asm.jump(done);
-    asm.place(little);
-    asm.op(Op::LoadWord, 16);
-    asm.when(Test::Equal, 1_u32.swap_bytes(), from_one);
-    asm.place(done);
+    by_order(asm, order, |asm, order| {
+        let half = |value: u32| word(order, value << 16) & 0xffff | word(order, value) & 0xffff;
+        asm.op(Op::LoadHalf, 30);
+        match exact {
+            Some(bytes) => asm.unless(Test::Equal, half(bytes), bad),
+            None => asm.unless(Test::AnyBit, half(0xff00), bad),
+        }
+    });
 }
 
 /// Two sequence numbers, at 12 and 20, must have the same upper word, and the upper half of the
 /// second one's lower word is one less than that of the first, the same, or larger by less than A.
-/// A sequence number is two words, the upper one first.
-fn check_range(asm: &mut Assembler, bad: Label) {
-    let [little, compare] = [(); 2].map(|()| asm.label());
+fn check_range(asm: &mut Assembler, order: ByteOrder, bad: Label) {
     asm.op(Op::Store, RANGE);
-    same_upper_word(asm, bad);
-    asm.op(Op::Recall, HEAD);
-    asm.when(Test::AnyBit, LITTLE, little);
-    asm.op(Op::LoadHalf, 16);
+    // The upper words are equal, whatever the byte order.
+    asm.op(Op::LoadWord, 12);
     asm.op(Op::Store, FIRST);
-    asm.op(Op::LoadHalf, 24);
-    asm.jump(compare);
-    asm.place(little);
-    little_halves(asm);
-    asm.place(compare);
+    asm.op(Op::LoadWord, 20);
+    asm.op(Op::RecallIndex, FIRST);
+    asm.unless(Test::EqualsIndex, 0, bad);
+    asm.op(Op::RecallIndex, POSITION);
+    by_order(asm, order, |asm, order| {
+        let is_little = order == ByteOrder::Little;
+        let upper_half = if is_little { 2 } else { 0 };
+        asm.op(Op::LoadHalf, 16 + upper_half);
+        if is_little {
+            swap_half(asm);
+        }
+        asm.op(Op::Store, FIRST);
+        asm.op(Op::LoadHalf, 24 + upper_half);
+        if is_little {
+            swap_half(asm);
+        }
+    });
     // A HEARTBEAT of a writer that has nothing ends one before its begin.
     asm.op(Op::Add, 1);
     asm.op(Op::RecallIndex, FIRST);
@@ -298,26 +319,6 @@ fn check_range(asm: &mut Assembler, bad: Label) {
     asm.op(Op::RecallIndex, RANGE);
     asm.when(Test::AboveIndex, 0, bad);
     asm.op(Op::RecallIndex, POSITION);
-}
-
-/// The upper words of two sequence numbers, at 12 and 20, are equal.
-fn same_upper_word(asm: &mut Assembler, bad: Label) {
-    asm.op(Op::LoadWord, 12);
-    asm.op(Op::Store, FIRST);
-    asm.op(Op::LoadWord, 20);
-    asm.op(Op::RecallIndex, FIRST);
-    asm.unless(Test::EqualsIndex, 0, bad);
-    asm.op(Op::RecallIndex, POSITION);
-}
-
-/// The upper halves of the lower words of two little-endian sequence numbers, at 12 and 20: the
-/// first in memory, the second in A.
-fn little_halves(asm: &mut Assembler) {
-    asm.op(Op::LoadHalf, 16 + 2);
-    swap_half(asm);
-    asm.op(Op::Store, FIRST);
-    asm.op(Op::LoadHalf, 24 + 2);
-    swap_half(asm);
 }
 
 /// Moves X to the next submessage. Without length PAD and INFO_TS are empty, and all others extend

@@ -70,7 +70,9 @@ impl WorkerSide for DdsWorkerSide {
     /// RustDDS does not tell which readers have a sample: one counts as written when it waits to be
     /// sent.
     async fn write(&self, messages: &[KeyedMessage]) -> Result<(), WriteError> {
-        self.adapter.check_up()?;
+        if !self.adapter.is_up() {
+            return Err(self.adapter.away().into());
+        }
         messages.iter().try_for_each(|message| self.write_one(message))
     }
 }

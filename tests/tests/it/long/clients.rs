@@ -7,7 +7,7 @@ use std::process::Command;
 use blaze_tests::process::binary;
 
 /// Runs one of `scripts/` with the programs beside this one.
-fn script(name: &str, arguments: &[&str]) {
+pub(super) fn script(name: &str, arguments: &[&str]) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let program = binary("blaze-config").unwrap();
     let output = Command::new(root.join("scripts").join(name))

@@ -10,6 +10,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("blaze-proto", &["blaze-domain"]),
     ("blaze-runtime", &[]),
     ("blaze-auth", &["blaze-domain"]),
+    ("blaze-convert", &[]),
     ("blaze-config", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-auth"]),
     ("blaze-brokers", &["blaze-domain", "blaze-proto", "blaze-runtime"]),
     (
