@@ -15,6 +15,10 @@ use crate::control::REPLY_PREFIX;
 pub const MAX_NAME_BYTES: usize = 63;
 /// Longest topic name, in bytes.
 pub const MAX_TOPIC_BYTES: usize = 200;
+/// Before the topic, the channel of its payloads without a header.
+const BARE_PREFIX: &str = "blaze/bare/";
+/// Before the topic, the channel of its payloads as JSON.
+const JSON_PREFIX: &str = "blaze/json/";
 
 /// Why a text is not a name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -95,12 +99,9 @@ fn check_topic(text: &str) -> Result<(), NameError> {
 }
 
 fn check_channel(text: &str) -> Result<(), NameError> {
-    // `blaze/bare/<topic>` is a channel of its own and may be longer than the topic that it
-    // carries.
-    match text.strip_prefix("blaze/bare/") {
-        Some(topic) => check_topic_form(topic),
-        None => check_topic_form(text),
-    }
+    // Channels of copies may be longer than the topic that they carry.
+    let of_copies = [BARE_PREFIX, JSON_PREFIX].iter().find_map(|prefix| text.strip_prefix(prefix));
+    check_topic_form(of_copies.unwrap_or(text))
 }
 
 macro_rules! name {
@@ -243,7 +244,13 @@ impl ChannelName {
     /// Where a topic is served to clients that want payloads without a header.
     #[must_use]
     pub fn bare(topic: &TopicName) -> Self {
-        Self(Arc::from(format!("blaze/bare/{topic}")))
+        Self(Arc::from(format!("{BARE_PREFIX}{topic}")))
+    }
+
+    /// Where a topic is served to clients that want payloads as JSON.
+    #[must_use]
+    pub fn json(topic: &TopicName) -> Self {
+        Self(Arc::from(format!("{JSON_PREFIX}{topic}")))
     }
 
     /// Where one life of a service gets its answers, on brokers that make channels as they are
@@ -316,7 +323,8 @@ mod tests {
         for reply in [own, ChannelName::shared_reply()] {
             assert_eq!(reply.as_str().parse::<ChannelName>().unwrap(), reply);
         }
-        let bare = ChannelName::bare(&longest);
-        assert_eq!(bare.as_str().parse::<ChannelName>().unwrap(), bare);
+        for copies in [ChannelName::bare(&longest), ChannelName::json(&longest)] {
+            assert_eq!(copies.as_str().parse::<ChannelName>().unwrap(), copies);
+        }
     }
 }

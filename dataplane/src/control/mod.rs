@@ -44,7 +44,7 @@ use planning::Dirty;
 use replicas::Replicas;
 pub use replicas::read_replica_message;
 pub use scopes::ScopeHealth;
-use scopes::{LOCAL, Scopes};
+use scopes::Scopes;
 
 /// A changed topic is planned after this much quiet …
 pub const QUIET: Duration = Duration::from_millis(50);
@@ -259,7 +259,7 @@ impl ControlCore {
         self.follow_choice(now);
         self.tell_layer_away(now);
         let listened = self.has_listened(now);
-        let knows_leases = !LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
+        let knows_leases = !Scope::LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
         if self.state == FlowState::Starting && listened && knows_leases && self.knows_replicas(now)
         {
             self.set_state(now, FlowState::Ready);

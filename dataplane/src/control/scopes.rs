@@ -9,11 +9,8 @@ use blaze_domain::{Scope, TopicName, WhyCode};
 use bytes::Bytes;
 
 use super::{ControlCore, Output};
-use crate::plan::{Bridge, Target};
+use crate::plan::Bridge;
 use crate::registry::Restored;
-
-/// The local scopes.
-pub(super) const LOCAL: [Scope; 2] = [Scope::Node, Scope::Layer];
 
 /// Others are told of a layer broker that has not answered for this long: it is as long as they
 /// need to notice that a flow has died.
@@ -128,7 +125,7 @@ impl ControlCore {
     /// Lets brokers make the channels of topics that are leased on them or that a bridge writes,
     /// and release the others.
     pub(super) fn update_channels(&mut self, topic: &TopicName) {
-        for scope in LOCAL {
+        for scope in Scope::LOCAL {
             if !self.config.lease_stores.contains(&scope) {
                 continue;
             }
@@ -166,11 +163,7 @@ impl ControlCore {
 }
 
 fn writes(bridge: &Bridge, scope: Scope) -> bool {
-    match bridge.to {
-        Target::Node { bare } => scope == Scope::Node && !bare,
-        Target::Layer => scope == Scope::Layer,
-        Target::Inter { .. } => false,
-    }
+    bridge.to.scope() == scope && !bridge.to.is_headless()
 }
 
 fn depth_of(bridge: &Bridge) -> u32 {

@@ -24,7 +24,7 @@ use super::routes::SourceState;
 use crate::control::ControlCore;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
 use crate::lane::stats::Drops;
-use crate::plan::Target;
+use crate::plan::{Form, Target};
 use crate::registry::{LeaseView, Terms};
 use crate::world::{Advertise, Request};
 
@@ -288,9 +288,14 @@ fn bridge_id(path: &TopicPath, bridge: &BridgeState, own_layer: &str) -> String 
     let topic = &path.name;
     let from = bridge.from;
     match &bridge.target {
-        Target::Node { bare: false } => format!("{topic}|{from}>node|{own_layer}"),
-        Target::Node { bare: true } => format!("{topic}|{from}>node|{own_layer}|bare"),
-        Target::Layer => format!("{topic}|{from}>layer|{own_layer}"),
+        target @ (Target::Node(_) | Target::Layer { .. } | Target::Ros2) => {
+            let form = match target {
+                Target::Node(Form::Bare) => "|bare",
+                target if target.is_json() => "|json",
+                _ => "",
+            };
+            format!("{topic}|{from}>{}|{own_layer}{form}", target.scope())
+        }
         Target::Inter { layer, receiver } => {
             let same_layer = |other: &&BridgeState| {
                 other.from == from
@@ -310,14 +315,13 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
         Phase::Failed { since } => ("failed", now.saturating_duration_since(since).as_secs_f64()),
         Phase::Draining { .. } | Phase::Ended => ("draining", 0.0),
     };
-    let (to_scope, layer, flow) = match &bridge.target {
-        Target::Node { .. } => (Scope::Node, shared.me.layer.to_string(), shared.me.to_string()),
-        Target::Layer => (Scope::Layer, shared.me.layer.to_string(), shared.me.to_string()),
-        Target::Inter { layer, receiver } => {
-            (Scope::Inter, layer.to_string(), receiver.to_string())
+    let (layer, flow) = match &bridge.target {
+        Target::Node(_) | Target::Layer { .. } | Target::Ros2 => {
+            (shared.me.layer.to_string(), shared.me.to_string())
         }
+        Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string()),
     };
-    let mut to = scope_and_broker(shared, to_scope);
+    let mut to = scope_and_broker(shared, bridge.target.scope());
     extend(&mut to, json!({"layer": layer, "flow": flow}));
     let dropped = dropped(&bridge.stats.dropped);
     let class = match bridge.sink {

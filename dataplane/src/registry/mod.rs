@@ -33,7 +33,8 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
 use blaze_domain::control::{
-    Answer, ControlError, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload,
+    Answer, ControlError, ControlMessage, ErrorCode, EventKind, LeaseKind, ParsedObject,
+    parse_payload,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Durability, FlowId, Scope, TopicName};
@@ -250,6 +251,11 @@ impl Registry {
     ) -> Result<u32, ControlError> {
         let message = object.message.as_ref().map_err(Clone::clone)?;
         let common = message.common();
+        if let ControlMessage::Call(_) = message {
+            let pointer = format!("{}/op", object.pointer);
+            let detail = "this flow is on no ROS 2 network: it cannot call services";
+            return Err(ControlError::new(ErrorCode::NoServer, pointer, detail));
+        }
         self.check_access(now, scope, message, &object.pointer)?;
         if scope == Scope::Layer
             && self.config.layer_answers_need_id
