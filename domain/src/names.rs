@@ -222,6 +222,34 @@ impl InstanceName {
     }
 }
 
+impl ServiceName {
+    /// The service that stands for a ROS 2 node: its full name in lower case, with `-` for all other
+    /// characters; `ros2` while the name is not known.
+    ///
+    /// ```
+    /// use blaze_domain::ServiceName;
+    /// assert_eq!(ServiceName::of_ros2_node("/arm/Talker_1").as_str(), "arm-talker-1");
+    /// assert_eq!(ServiceName::of_ros2_node("").as_str(), "ros2");
+    /// ```
+    #[must_use]
+    pub fn of_ros2_node(full_name: &str) -> Self {
+        let mut name = String::new();
+        for c in full_name.chars() {
+            let is_good = c.is_ascii_alphanumeric();
+            if is_good {
+                name.push(c.to_ascii_lowercase());
+            } else if !name.is_empty() && !name.ends_with('-') {
+                name.push('-');
+            }
+            if name.len() >= MAX_NAME_BYTES {
+                break;
+            }
+        }
+        let name = name.trim_end_matches('-');
+        Self(Arc::from(if name.is_empty() { "ros2" } else { name }))
+    }
+}
+
 impl From<&TopicName> for ChannelName {
     fn from(topic: &TopicName) -> Self {
         Self(Arc::clone(&topic.0))
@@ -291,6 +319,22 @@ mod tests {
             (&"a".repeat(64), NameError::TooLong { bytes: 64, limit: 63 }),
         ] {
             assert_eq!(bad.parse::<NodeName>().unwrap_err(), why, "{bad}");
+        }
+    }
+
+    #[test]
+    fn every_ros2_node_has_a_service_name() {
+        let long = format!("/{}_x", "a".repeat(62));
+        for (node, service) in [
+            ("/talker", "talker"),
+            ("/arm//__Talker_1__", "arm-talker-1"),
+            ("/ä/ö", "ros2"),
+            ("/é_1", "1"),
+            (long.as_str(), &"a".repeat(62)),
+        ] {
+            let name = ServiceName::of_ros2_node(node);
+            assert_eq!(name.as_str(), service, "{node}");
+            assert!(name.as_str().parse::<ServiceName>().is_ok());
         }
     }
 

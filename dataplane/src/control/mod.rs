@@ -16,6 +16,7 @@ mod info;
 mod output;
 mod planning;
 mod replicas;
+mod ros2;
 mod routes;
 mod scopes;
 
@@ -43,6 +44,7 @@ pub use output::{ControlConfig, Output};
 use planning::Dirty;
 use replicas::Replicas;
 pub use replicas::read_replica_message;
+use ros2::Ros2;
 pub use scopes::ScopeHealth;
 use scopes::Scopes;
 
@@ -70,6 +72,7 @@ pub struct ControlCore {
     /// Who advertises which topic as transient_local, in any flow.
     durable: BTreeMap<TopicName, BTreeSet<OriginFilter>>,
     replicas: Replicas,
+    ros2: Ros2,
     gateways: Gateways,
     carriers: Carriers,
     balance: Balance,
@@ -107,6 +110,7 @@ impl ControlCore {
             gateways,
             carriers: Carriers::default(),
             balance: Balance::default(),
+            ros2: Ros2::default(),
             config,
             registry,
             plans: BTreeMap::new(),
@@ -275,6 +279,7 @@ impl ControlCore {
         self.save_leases();
         let changed = self.registry.watch_flows(now);
         self.touch(now, changed);
+        self.follow_ros2(now);
         self.hurry(now);
         if now.saturating_duration_since(self.reconciled) >= RECONCILE {
             self.reconciled = now;

@@ -3,6 +3,7 @@
 mod balance;
 mod gateways;
 mod replicas;
+mod ros2;
 
 use blaze_domain::LayerKind;
 use blaze_domain::node_file::{AccessRules, AutoBool};

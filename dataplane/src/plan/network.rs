@@ -143,3 +143,86 @@ pub fn holder<'w>(
     let precedes = |(id, flow): &(&FlowId, &FlowView)| (flow.epoch, *id) < (own.epoch, &world.me);
     others.find(precedes).map(|(id, _)| id)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::tests::worlds::{id, network, topic, world};
+
+    fn guid(n: u8) -> WriterId {
+        WriterId([n; 16])
+    }
+
+    #[test]
+    fn a_writer_belongs_to_the_flow_that_has_one_of_its_addresses() {
+        let mut world = world(&["e/a net1", "e/b net1", "e/c net2", "f/d net1", "e/e net1 down"]);
+        let at = |n: u8| Ipv4Addr::new(10, 0, 0, n);
+        for (n, view) in (1..).zip(world.flows.values_mut()) {
+            view.ros2.as_mut().unwrap().address = at(n);
+        }
+        let all = candidates(&world);
+        assert_eq!(all, [(id("e/a"), at(1)), (id("e/b"), at(2))], "of one layer, alive");
+        assert_eq!(claimant(&all, &[at(9), at(2)], guid(1)), Some(&id("e/b")));
+        assert_eq!(claimant(&all, &[at(9)], guid(1)), None);
+        world.me = id("f/d");
+        assert_eq!(candidates(&world).len(), 1);
+    }
+
+    #[test]
+    fn of_several_that_could_own_a_writer_hashing_chooses_one() {
+        let flows = ["e/a net1", "e/b net1", "e/c net1"];
+        let all = candidates(&world(&flows));
+        let mut owned = BTreeMap::new();
+        for n in 0..90 {
+            let owner = claimant(&all, &[Ipv4Addr::LOCALHOST], guid(n)).unwrap();
+            assert_eq!(heir(&all, guid(n)), Some(owner), "the same hash");
+            *owned.entry(owner).or_insert(0) += 1;
+        }
+        assert!(owned.len() == 3 && owned.values().all(|count| *count > 10), "{owned:?}");
+        assert_eq!(heir(&[], guid(1)), None);
+    }
+
+    #[test]
+    fn one_flow_writes_a_topic_to_a_network() {
+        let lines = ["e/a net1", "e/b net1", "e/c net1", "e/d net2", "e/x net1 draining"];
+        let world = world(&lines);
+        let networks = networks(&world);
+        let of = |flow: &str| {
+            let (id, view) = world.flows.get_key_value(&id(flow)).unwrap();
+            Network::of(id, view).unwrap()
+        };
+        let chosen = writer(&networks, of("e/a"), &topic()).unwrap();
+        assert_eq!(writer(&networks, of("e/c"), &topic()), Some(chosen));
+        assert_eq!(writer(&networks, of("e/d"), &topic()), Some(&id("e/d")));
+        for (name, is_one) in
+            [("add/_request", true), ("add/_reply", true), ("a/_request/b", false), ("x", false)]
+        {
+            assert_eq!(is_of_service(&name.parse().unwrap()), is_one, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_network_belongs_to_the_layer_whose_flow_is_older() {
+        let nobody = BTreeSet::new();
+        let of = |lines: &[&str], epochs: [u64; 2], found: &BTreeSet<FlowId>| {
+            let mut world = world(lines);
+            for (view, epoch) in world.flows.values_mut().zip(epochs) {
+                view.epoch = epoch;
+            }
+            world.me = id("f/m");
+            holder(&world, network(1), found).cloned()
+        };
+        let one = ["e/a net1", "f/m net1"];
+        let held = Some(id("e/a"));
+        assert_eq!(of(&one, [1, 2], &nobody), held);
+        assert_eq!(of(&one, [2, 2], &nobody), held, "the smaller name");
+        assert_eq!(of(&one, [3, 2], &nobody), None);
+        assert_eq!(of(&["e/a net1 starting", "f/m net1"], [1, 2], &nobody), held);
+        assert_eq!(of(&["e/a net1 down", "f/m net1"], [1, 2], &nobody), None);
+        assert_eq!(of(&["f/a net1", "f/m net1"], [1, 2], &nobody), None, "one layer");
+        let two = ["e/a net9", "f/m net1"];
+        assert_eq!(of(&two, [1, 2], &nobody), None);
+        assert_eq!(of(&two, [1, 2], &BTreeSet::from([id("e/a")])), held, "found on it");
+        assert_eq!(of(&["e/a", "f/m net1"], [1, 2], &BTreeSet::from([id("e/a")])), None);
+    }
+}

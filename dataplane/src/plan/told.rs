@@ -80,7 +80,7 @@ fn merge<'a>(entries: impl IntoIterator<Item = &'a ScopeEntry>) -> ScopeEntry {
 
 /// Advertisements of several scopes as one: sum of rates, largest size, strongest quality of
 /// service.
-pub(super) fn merge_offers<'a>(
+pub(crate) fn merge_offers<'a>(
     offers: impl IntoIterator<Item = &'a Advertise>,
 ) -> Option<Advertise> {
     let mut offers = offers.into_iter().peekable();
@@ -123,7 +123,9 @@ fn add_offer(merged: &mut Advertise, other: &Advertise) {
 
 /// Requests of several scopes as one: highest rate, strongest quality of service, every origin that
 /// one of them asks for.
-fn merge_requests<'a>(requests: impl IntoIterator<Item = &'a Request>) -> Option<Request> {
+pub(crate) fn merge_requests<'a>(
+    requests: impl IntoIterator<Item = &'a Request>,
+) -> Option<Request> {
     let mut requests = requests.into_iter().peekable();
     let first = requests.next()?;
     let mut merged = first.clone();

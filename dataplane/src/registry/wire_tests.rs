@@ -210,6 +210,25 @@ fn names_of_requesters_are_no_part_of_the_digest() {
     assert_eq!(entry_hash(&entry(vec![named], 7)), entry_hash(&entry(Vec::new(), 0)));
 }
 
+/// Flows of earlier versions reckon it without them.
+#[test]
+fn what_is_told_of_ros2_and_json_is_no_part_of_the_digest() {
+    let plain = wire::Entry {
+        topic: "a".into(),
+        layer_request: Some(wire::Request::default()),
+        ..wire::Entry::default()
+    };
+    let request = wire::Request { json: true, unframed: true, ..wire::Request::default() };
+    let more = wire::Entry {
+        layer_request: Some(request),
+        ros2_advertise: Some(wire::Advertise::default()),
+        ros2_request: Some(wire::Request::default()),
+        ..plain.clone()
+    };
+    assert_eq!(entry_hash(&plain), entry_hash(&more));
+    assert_eq!(from_wire(&plain).unwrap().1.ros2, ScopeEntry::default());
+}
+
 #[test]
 fn absurd_numbers_of_others_become_none() {
     for rate in [f64::NAN, f64::INFINITY, -1.0, 0.0] {

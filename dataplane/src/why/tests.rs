@@ -450,7 +450,16 @@ fn rows() -> Vec<Row> {
         "an endpoint without an address": PAIR,
             |s| s.route("c/b", None, StepKind::Deliver, WhyCode::Unreachable)
             => NotFlowing Unreachable Deliver;
-        "a native path": PAIR, |s| s.routes.push(RouteFacts {
+        "two ROS 2 nodes on one network": &["e/a net1 ros2+ ros2-"], |_| {} => Flowing NativePath Plan;
+        "of two flows on it": &["e/a@1 net1 ros2+ ros2-", "e/b@1 net1 ros2-"], |_| {}
+            => Flowing NativePath Plan;
+        "a ROS 2 writer for another layer": &["e/a net1 ros2+", "c/b net1 ros2-"], |_| {}
+            => Flowing Ok;
+        "no bridge from ROS 2 yet": &["e/a net1 ros2+", "c/b net1 ros2-"], |s| s.bridges.clear()
+            => NotFlowing BridgeStarting Bridge;
+        "JSON that is not converted": &["e/a@1 node+ layer-j"],
+            |s| s.drops(DropReason::ConvertError, 0) => NotFlowing ConvertError Deliver;
+        "a route that is native, as another flow says": PAIR, |s| s.routes.push(RouteFacts {
             flow: id("c/b"), to_layer: id("c/b").layer, receiver: None, step: StepKind::Deliver,
             ok: true, code: WhyCode::NativePath,
         }) => Flowing NativePath Deliver;

@@ -3,6 +3,7 @@
 mod allocation;
 mod compress_stage;
 mod load;
+mod ros2;
 mod succession;
 
 use std::collections::BTreeMap;

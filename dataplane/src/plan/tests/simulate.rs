@@ -70,6 +70,8 @@ pub(super) struct Simulation<'a> {
     /// The layer scopes and the ROS 2 networks that flows are on.
     layers: BTreeMap<&'a FlowId, Place>,
     networks: BTreeMap<&'a FlowId, Place>,
+    /// How flows treat what comes to them over the inter scope, as far as that was looked at.
+    intakes: BTreeMap<FlowId, Vec<(Target, LaneSpec)>>,
     /// Who asks where.
     requests: BTreeMap<Place, Vec<&'a Request>>,
     /// Messages that reached a requester over a bridge.
@@ -109,6 +111,7 @@ impl<'a> Simulation<'a> {
             useful: BTreeSet::new(),
             layers: BTreeMap::new(),
             networks: BTreeMap::new(),
+            intakes: BTreeMap::new(),
             requests: BTreeMap::new(),
             carried: 0,
             relayed: 0,
@@ -367,7 +370,16 @@ impl<'a> Simulation<'a> {
     }
 
     /// What a flow does with a message from the inter scope.
-    fn intake(&self, receiver: &FlowId) -> Vec<(Target, LaneSpec)> {
+    fn intake(&mut self, receiver: &FlowId) -> Vec<(Target, LaneSpec)> {
+        if let Some(known) = self.intakes.get(receiver) {
+            return known.clone();
+        }
+        let intake = self.find_intake(receiver);
+        self.intakes.insert(receiver.clone(), intake.clone());
+        intake
+    }
+
+    fn find_intake(&self, receiver: &FlowId) -> Vec<(Target, LaneSpec)> {
         let bridges = self.plans[receiver].bridges.iter();
         let bridges = bridges.filter(|bridge| bridge.from == Scope::Inter);
         if self.intake == Intake::Bridges {

@@ -155,6 +155,7 @@ pub(crate) fn entry<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mu
     let entry = world.flows.get_mut(&id(flow)).unwrap().topics.entry(topic()).or_default();
     match scope {
         "node" => &mut entry.node,
+        "ros2" => &mut entry.ros2,
         _ => &mut entry.layer,
     }
 }
