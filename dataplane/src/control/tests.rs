@@ -300,6 +300,18 @@ fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
 }
 
 #[test]
+fn the_channel_of_json_copies_is_made_for_those_who_ask_for_them() {
+    let mut bench = Bench::ready();
+    let mut ask = lease("request", "odom");
+    ask["json"] = true.into();
+    bench.channels();
+    bench.send(Scope::Layer, &ask);
+    assert_eq!(bench.channels(), ["+layer odom 0", "+layer blaze/json/odom 0"]);
+    bench.send(Scope::Layer, &lease("withdraw", "odom"));
+    assert_eq!(bench.channels(), ["-layer odom", "-layer blaze/json/odom"]);
+}
+
+#[test]
 fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     let mut bench = Bench::ready();
     // Another node of the layer asks for `imu_data` of this node: only the way over Kafka is

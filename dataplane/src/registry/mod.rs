@@ -443,6 +443,13 @@ impl Registry {
         of_scope.map(depth).max()
     }
 
+    /// Whether a service of that scope asks for the topic as JSON.
+    #[must_use]
+    pub fn wants_json(&self, topic: &TopicName, scope: Scope) -> bool {
+        let mut of_scope = self.leases.of_topic(topic).filter(|lease| lease.key.scope == scope);
+        of_scope.any(|lease| matches!(lease.terms, Terms::Request { json: true, .. }))
+    }
+
     /// All leases, by topic.
     pub fn leases(&self) -> impl Iterator<Item = LeaseView<'_>> {
         self.leases.all()
