@@ -223,8 +223,8 @@ impl InstanceName {
 }
 
 impl ServiceName {
-    /// The service that stands for a ROS 2 node: its full name in lower case, with `-` for all other
-    /// characters; `ros2` while the name is not known.
+    /// The service that stands for a ROS 2 node: its full name in lower case, with `-` for all
+    /// other characters; `ros2` while the name is not known.
     ///
     /// ```
     /// use blaze_domain::ServiceName;

@@ -1,5 +1,5 @@
-//! ROS 2 networks: which flow owns a writer there, which one writes a message there, and which layer
-//! a network belongs to.
+//! ROS 2 networks: which flow owns a writer there, which one writes a message there, and which
+//! layer a network belongs to.
 //!
 //! ```text
 //! writers ──► one flow owns each: it reads it, and announces it as a service of its own
@@ -7,8 +7,9 @@
 //!             that hashing chooses for the topic
 //! ```
 //!
-//! Between endpoints of one network there is no bridge. To the flow that writes for it, a network is
-//! like a node scope: a message from elsewhere comes to it over the layer broker or the inter scope.
+//! Between endpoints of one network there is no bridge. To the flow that writes for it, a network
+//! is like a node scope: a message from elsewhere comes to it over the layer broker or the inter
+//! scope.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::Ipv4Addr;
@@ -33,8 +34,8 @@ impl<'w> Network<'w> {
 }
 
 /// Flows on a network, sorted. What was born on their nodes, or on the network, they write there
-/// themselves, so that the flow that writes the rest leaves it out. A service of the layer scope may
-/// name any node of its layer: what counts is the way that a message has come.
+/// themselves, so that the flow that writes the rest leaves it out. A service of the layer scope
+/// may name any node of its layer: what counts is the way that a message has come.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Natives {
     /// Those that share the layer broker.

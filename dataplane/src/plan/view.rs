@@ -11,7 +11,7 @@ use std::sync::Arc;
 use blaze_domain::node_file::TopicAccess;
 use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 
-use super::network::{Network, Networks};
+use super::network::{self as networks, Network, Networks};
 use super::survey::Holder;
 use super::{Blocked, Destination, Survey, rendezvous};
 use crate::world::{
@@ -226,11 +226,14 @@ impl<'w> TopicView<'w> {
             && view.role.is_gateway()
             && !self.role.is_gateway();
         let outside = (behind && carries).then_some((Scope::Inter, &entry.outside));
+        // A call from a node is for the flow of its server, also of one on the own network.
+        let of_service = networks::is_of_service(self.topic);
         for (scope, entry) in node.into_iter().chain(layer).chain(ros2).chain(outside) {
             if let Some(advertise) = entry.advertise.as_ref().filter(|_| carries) {
+                let network = network.filter(|_| scope != Scope::Node || !of_service);
                 self.publishers.push(Publisher { flow, group, scope, network, advertise });
             }
-            // All flows of a network say the same of its readers: those of the one that writes count.
+            // All flows of a network say the same of its readers: only the one that writes counts.
             let counts = scope != Scope::Ros2 || !carries || self.writes(flow, network);
             if let Some(request) = entry.request.as_ref().filter(|_| counts) {
                 let requester = Requester { flow, group, scope, network, request };

@@ -1,5 +1,5 @@
-//! Endpoints of the own ROS 2 network, as its adapter finds them: beside leases the second source of
-//! what is announced.
+//! Endpoints of the own ROS 2 network, as its adapter finds them: beside leases the second source
+//! of what is announced.
 //!
 //! ```text
 //! set_found ─► owner of each endpoint ─► merged per topic ─► own topics in the World, scope ros2
@@ -175,8 +175,8 @@ impl Registry {
         }
     }
 
-    /// Replaces what was found of a topic on the ROS 2 network; an empty list takes it away. Returns
-    /// the topics to plan anew.
+    /// Replaces what was found of a topic on the ROS 2 network; an empty list takes it away.
+    /// Returns the topics to plan anew.
     pub fn set_found(
         &mut self,
         now: Instant,

@@ -450,7 +450,8 @@ fn rows() -> Vec<Row> {
         "an endpoint without an address": PAIR,
             |s| s.route("c/b", None, StepKind::Deliver, WhyCode::Unreachable)
             => NotFlowing Unreachable Deliver;
-        "two ROS 2 nodes on one network": &["e/a net1 ros2+ ros2-"], |_| {} => Flowing NativePath Plan;
+        "two ROS 2 nodes on one network": &["e/a net1 ros2+ ros2-"], |_| {}
+            => Flowing NativePath Plan;
         "of two flows on it": &["e/a@1 net1 ros2+ ros2-", "e/b@1 net1 ros2-"], |_| {}
             => Flowing NativePath Plan;
         "a ROS 2 writer for another layer": &["e/a net1 ros2+", "c/b net1 ros2-"], |_| {}

@@ -32,7 +32,7 @@ const RULES: &str = "
     one network to another, at its reader | e/b@1 net2 ros2-, e/a@1 net1 ros2+ | layer>ros2
     the same network in another layer is another one | e/a net1 ros2+, c/b net1 ros2- | ros2>c/b
     one copy per layer | e/a net1 ros2+, c/b@1 net1 ros2- node- layer- | ros2>c/b
-    its receiver writes all three | c/b@1 net1 ros2- node- layer-, e/a node+ | inter>node, inter>layer, inter>ros2
+    its receiver | c/b@1 net1 ros2- node- layer-, e/a node+ | inter>node, inter>layer, inter>ros2
     a flow without a network has no part in it | e/a ros2+ ros2- node- node+ |
     JSON on one node | e/a node+ node-j | node>json
     JSON from the layer | e/a@1 layer+ node-j | layer>json
@@ -96,6 +96,28 @@ fn flows_without_a_common_broker_share_a_network_too() {
         .find(|bridge| (bridge.from, &bridge.to) == (Scope::Inter, &Target::Ros2))
         .unwrap();
     assert!(to_ros2.lane.natives.write(Scope::Inter, 1, "e", other), "its own flow writes it");
+}
+
+#[test]
+fn requests_to_services_go_to_the_flow_of_their_server() {
+    let lines = ["e/a@1 net1 node+", "e/b@1 net1 ros2-", "e/c@1 net1 ros2-"];
+    let mut world = world(&lines);
+    assert_eq!(ways(&plan_of(&world, "e/b")).len() + ways(&plan_of(&world, "e/c")).len(), 0);
+    let name: blaze_domain::TopicName = "add/_request".parse().unwrap();
+    for view in world.flows.values_mut() {
+        let entry = view.topics.remove(&topic()).unwrap();
+        view.topics.insert(name.clone(), entry);
+    }
+    let plan = |flow: &str| {
+        let world = World { me: id(flow), ..world.clone() };
+        plan_topic(&world, &name, &PlanRules::default(), None)
+    };
+    assert_eq!(ways(&plan("e/a")), ["node>layer"]);
+    for flow in ["e/b", "e/c"] {
+        let plan = plan(flow);
+        assert_eq!(ways(&plan), ["layer>ros2"], "each writes what names it");
+        assert!(!plan.bridges[0].lane.natives.write(Scope::Layer, 1, "e", "a"));
+    }
 }
 
 #[test]

@@ -90,8 +90,8 @@ pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
 }
 
 /// A world written as one line per flow: `edge/a@1 node+ layer-`: `@1` is its layer broker, `+` an
-/// advertisement on that scope, `-` a request, `-b` a request for bare payloads, `-j` for JSON; `net1`
-/// its ROS 2 network; `down`, `suspect`,
+/// advertisement on that scope, `-` a request, `-b` a request for bare payloads, `-j` for JSON;
+/// `net1` its ROS 2 network; `down`, `suspect`,
 /// `starting`, `draining` and `settled` as they read; `away`: its layer broker does not answer it;
 /// `many`: it sends to more flows than it names; `carries` and `handed` say who carries the topic
 /// out of the layer, `>c/b` whom it is sent to. The first flow is `me`.

@@ -29,6 +29,10 @@ impl<'w> TopicView<'w> {
 
     /// Flows on the own network.
     pub(crate) fn natives(&self) -> Natives {
+        if network::is_of_service(self.topic) {
+            // Requests and replies name the flow that writes them.
+            return Natives::default();
+        }
         let own = self.world.flows.get_key_value(self.me);
         let network = own.and_then(|(id, view)| Network::of(id, view));
         let flows = network.and_then(|network| self.networks.get(&network));
