@@ -21,8 +21,8 @@ use std::time::{Duration, Instant};
 use blaze_brokers::dds::{
     Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer, Written,
 };
-use blaze_brokers::ros2::{GidLength, Ros2Config, Ros2Network, RosTopic};
-use blaze_brokers::{Content, Health, Publisher, PublisherOptions, SubscribeOptions};
+use blaze_brokers::ros2::{GidLength, Ros2Broker, Ros2Config};
+use blaze_brokers::{Broker as _, Content, Health, Publisher, PublisherOptions, SubscribeOptions};
 use bytes::{BufMut, BytesMut};
 use rustdds::WriteOptionsBuilder;
 use rustdds::rpc::SampleIdentity;
@@ -240,7 +240,7 @@ fn watch(participant: &Participant, time: Duration) -> Result<(), Error> {
 
 /// Echoes what owned writers publish, through the adapter.
 async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
-    let network = Ros2Network::open(Ros2Config {
+    let network = Ros2Broker::open(Ros2Config {
         flow: "edge/robot-1".parse()?,
         domain,
         interface: Ipv4Addr::LOCALHOST,
@@ -251,17 +251,13 @@ async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
     let until = tokio::time::Instant::now() + time;
     let mut status = network.status();
     status.wait_for(|status| status.health == Health::Up).await?;
-    let topic = |name: &str| -> Result<RosTopic, Error> {
-        let type_name = "std_msgs/msg/UInt8MultiArray".to_owned();
-        Ok(RosTopic { topic: name.parse()?, type_name, deadline: None, lease: None })
-    };
     let publisher = |depth| -> Result<Arc<dyn Publisher>, Error> {
         let options = PublisherOptions { reliable: true, large: true, depth };
-        Ok(network.publisher(&topic("big_reply")?, options)?)
+        Ok(network.publisher(&"big_reply".parse()?, options)?)
     };
     let mut publishers = HashMap::<u32, Arc<dyn Publisher>>::new();
     let ask = SubscribeOptions { large: true, with_kept: true, ..SubscribeOptions::default() };
-    let mut subscription = network.subscribe(&topic("big")?, ask).await?;
+    let mut subscription = network.subscribe(&"big".parse()?, ask).await?;
     let mut found = network.network();
     let mut numbers = HashMap::<_, Numbers>::new();
     let mut batch = Vec::new();

@@ -1,17 +1,20 @@
 //! Samples of a ROS 2 network: CDR of any type, identified as RTPS does.
 
 use std::net::Ipv4Addr;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock, Weak};
 use std::time::Instant;
 
 use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, WriterId};
 use blaze_proto::{Frame, Header};
 use rustdds::{Timestamp, WriteOptionsBuilder};
 
+use super::Inner;
 use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
 use super::names::{OWN_NAMESPACE, UNKNOWN_SERVICE, node_of_flow, service_of_node, type_of_dds};
 use super::network::Knowledge;
-use crate::dds::adapter::{Admission, Companion, Decoded, Dialect, Encoded, Others, Topic, nanos};
+use crate::dds::adapter::{
+    Admission, Companion, Dialect, Encoded, NoMessage, Others, Topic, nanos,
+};
 use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
@@ -38,6 +41,8 @@ pub(super) struct Ros {
     pub(super) knowledge: Arc<Knowledge>,
     /// Announces the participant to peers, and to those of this host that RustDDS leaves out.
     pub(super) relay: Relay,
+    /// Who reads and writes topics; none while it is opened.
+    pub(super) user: Arc<OnceLock<Weak<Inner>>>,
 }
 
 impl Dialect for Ros {
@@ -82,23 +87,25 @@ impl Dialect for Ros {
 
     fn note_endpoints(&self, endpoints: &Endpoints) {
         self.knowledge.note_endpoints(Instant::now(), endpoints);
+        if let Some(user) = self.user.get().and_then(Weak::upgrade) {
+            user.follow();
+        }
     }
 
     fn admission(&self, writer: &EndpointId) -> Admission {
         self.knowledge.admission(writer)
     }
 
-    fn decode(&self, topic: &Topic, sample: &Sample) -> Decoded {
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Content, NoMessage> {
         let id = sample.writer_guid.to_bytes();
-        let Some(writer) = self.knowledge.writer(&id) else { return Decoded::NotForUs };
+        let writer = self.knowledge.writer(&id).ok_or(NoMessage::NotForUs)?;
         // RustDDS looks at names of topics alone.
         if writer.dds_type != *topic.type_name {
-            return Decoded::NotForUs;
+            return Err(NoMessage::NotForUs);
         }
-        let Some(type_name) = &writer.type_name else { return Decoded::NotForUs };
-        let Ok(sequence) = u64::try_from(i64::from(sample.sequence_number)) else {
-            return Decoded::Malformed;
-        };
+        let type_name = writer.type_name.as_ref().ok_or(NoMessage::NotForUs)?;
+        let sequence =
+            u64::try_from(i64::from(sample.sequence_number)).map_err(|_| NoMessage::Malformed)?;
         let written = sample.source_timestamp().map_or(0, nanos);
         let service = match &writer.node {
             Some(node) => service_of_node(node),
@@ -128,10 +135,8 @@ impl Dialect for Ros {
                 u64::try_from(written).unwrap_or(0),
             )
         };
-        match Frame::new(&header, sample.sample.payload().clone()) {
-            Ok(frame) => Decoded::Message(Content::Frame(frame)),
-            Err(_) => Decoded::Malformed,
-        }
+        let frame = Frame::new(&header, sample.sample.payload().clone());
+        frame.map(Content::Frame).map_err(|_| NoMessage::Malformed)
     }
 
     fn encode(&self, topic: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {

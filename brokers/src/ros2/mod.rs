@@ -3,36 +3,43 @@
 //!
 //! ```text
 //! discovery, ros_discovery_info ─► Knowledge ─► Network: endpoints with type, QoS and node
-//! subscribe(topic, type) ─► DDS reader ─► samples of owned writers ─► frames
-//! publisher(topic, type) ─► DDS writer, in the node `/blaze/<layer>_<node>`
+//! subscribe(topic) ─► a DDS reader per type of owned writers ─► samples ─► frames
+//! publisher(topic) ─► a DDS writer per type, in the node `/blaze/<layer>_<node>`
 //! ```
 //!
 //! Readers and writers of flows are marked, and never bridged. RustDDS matches by topic name alone,
-//! so types are checked here, by writer.
+//! so types are checked here, by writer. What is read and offered follows the endpoints that come
+//! and go.
 
 mod dialect;
 mod endpoint;
 mod graph;
 pub mod names;
 mod network;
+mod offers;
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::net::{IpAddr, Ipv4Addr};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
+use async_trait::async_trait;
+use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, TopicName};
+use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use crate::dds::adapter::{Adapter, Topic};
+use crate::dds::adapter::{Adapter, Topic, TopicPublisher};
 use crate::dds::layer::DdsCounts;
 use crate::dds::{DdsError, EndpointId, Relay, RelayConfig, SLOTS, Terms};
 use crate::port::{
-    BrokerError, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions,
+    Subscription, SubscriptionSender,
 };
 use dialect::Ros;
-use names::{InexpressibleName, RosName, type_to_dds};
+use names::{RosName, type_to_dds};
 use network::Knowledge;
+use offers::{Offer, Offered};
 
 pub use dialect::KEPT_SAMPLES;
 pub use endpoint::{RosEndpoint, Vendor};
@@ -60,28 +67,34 @@ pub struct Ros2Config {
 const PEER_SLOTS: u16 = 32;
 /// Time between two announcements to the same participant.
 const ANNOUNCE: Duration = Duration::from_secs(2);
-
-/// What a topic is on the network.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RosTopic {
-    /// The topic.
-    pub topic: TopicName,
-    /// Its type, `sensor_msgs/msg/Imu`.
-    pub type_name: String,
-    /// Offered by a writer, or asked for by a reader.
-    pub deadline: Option<Duration>,
-    /// Lease of liveliness, likewise.
-    pub lease: Option<Duration>,
-}
+/// Topics that are read or written at once, each.
+const MAX_TOPICS: usize = 4096;
 
 /// A participant of a ROS 2 network.
-pub struct Ros2Network {
+pub struct Ros2Broker {
+    inner: Arc<Inner>,
+}
+
+/// What the broker shares with its publishers, and with the thread that watches endpoints.
+struct Inner {
     adapter: Adapter,
     knowledge: Arc<Knowledge>,
     namespace: String,
+    offers: Mutex<Vec<Weak<Offer>>>,
+    reads: Mutex<Vec<Read>>,
 }
 
-impl Ros2Network {
+/// A topic that the flow reads.
+struct Read {
+    topic: TopicName,
+    name: RosName,
+    sender: SubscriptionSender,
+    options: SubscribeOptions,
+    /// DDS types that it is read in.
+    types: BTreeSet<String>,
+}
+
+impl Ros2Broker {
     /// Starts in the background: the status tells how far it is. An interface that is missing is no
     /// error: it is looked for each second.
     ///
@@ -99,80 +112,162 @@ impl Ros2Network {
             holds_multicast: false,
             repeat: ANNOUNCE,
         })?;
-        let ros =
-            Ros { flow: config.flow, gid: config.gid, knowledge: Arc::clone(&knowledge), relay };
+        let user = Arc::<OnceLock<Weak<Inner>>>::default();
+        let ros = Ros {
+            flow: config.flow,
+            gid: config.gid,
+            knowledge: Arc::clone(&knowledge),
+            relay,
+            user: Arc::clone(&user),
+        };
         let adapter = Adapter::open(Arc::new(ros), config.domain, config.interface)?;
-        Ok(Self { adapter, knowledge, namespace: config.namespace })
-    }
-
-    /// Whether the participant stands, and its changes.
-    #[must_use]
-    pub fn status(&self) -> watch::Receiver<BrokerStatus> {
-        self.adapter.status()
+        let inner = Arc::new(Inner {
+            adapter,
+            knowledge,
+            namespace: config.namespace,
+            offers: Mutex::default(),
+            reads: Mutex::default(),
+        });
+        let _ = user.set(Arc::downgrade(&inner));
+        Ok(Self { inner })
     }
 
     /// The endpoints of ROS 2 nodes, and their changes.
     #[must_use]
     pub fn network(&self) -> watch::Receiver<Arc<Network>> {
-        self.knowledge.subscribe()
+        self.inner.knowledge.subscribe()
     }
 
     /// What it has counted.
     #[must_use]
     pub fn counts(&self) -> DdsCounts {
-        self.adapter.counts()
+        self.inner.adapter.counts()
     }
 
     /// Which writers this flow takes messages of (`true`), and which others do. Messages of those
     /// that are not named wait for a moment, since discovery may be ahead of the decision.
     pub fn set_owned(&self, owned: HashMap<EndpointId, bool>) {
-        self.knowledge.set_owned(owned);
-        self.adapter.look_again();
+        self.inner.knowledge.set_owned(owned);
+        self.inner.adapter.look_again();
+    }
+}
+
+#[async_trait]
+impl Broker for Ros2Broker {
+    fn kind(&self) -> BrokerKind {
+        BrokerKind::Ros2
     }
 
-    /// A writer of a topic. Messages of another type than its own, and those that are no
-    /// little-endian CDR, are dropped.
-    ///
-    /// # Errors
-    /// [`BrokerError::Name`] where ROS 2 can have no such topic or type.
-    pub fn publisher(
+    fn status(&self) -> watch::Receiver<BrokerStatus> {
+        self.inner.adapter.status()
+    }
+
+    /// Writes a topic. Messages say their type in `encoding`; others are dropped, and so are those
+    /// that are no little-endian CDR.
+    fn publisher(
         &self,
-        topic: &RosTopic,
+        channel: &ChannelName,
         options: PublisherOptions,
     ) -> Result<Arc<dyn Publisher>, BrokerError> {
-        Ok(Arc::new(self.adapter.publisher(self.topic(topic)?, options)?))
+        let (topic, name) = self.inner.name(channel)?;
+        let mut offers = self.inner.offers.lock();
+        offers.retain(|offer| offer.strong_count() > 0);
+        if offers.len() >= MAX_TOPICS {
+            return Err(BrokerError::TooManyChannels(MAX_TOPICS));
+        }
+        let offer = Arc::new(Offer::new(topic, name, options, Arc::downgrade(&self.inner)));
+        offers.push(Arc::downgrade(&offer));
+        Ok(offer)
     }
 
-    /// Reads what the owned writers of a topic publish in its type, as frames.
-    ///
-    /// # Errors
-    /// [`BrokerError::Name`] where ROS 2 can have no such topic or type; others when it cannot be
-    /// read now.
-    pub async fn subscribe(
+    /// Reads what the owned writers of a topic publish, as frames; also of writers that come later.
+    async fn subscribe(
         &self,
-        topic: &RosTopic,
+        channel: &ChannelName,
         options: SubscribeOptions,
     ) -> Result<Subscription, BrokerError> {
-        self.adapter.subscribe(self.topic(topic)?, options).await
+        self.inner.adapter.check_up()?;
+        let (topic, name) = self.inner.name(channel)?;
+        let (sender, subscription) = crate::port::subscription(options);
+        let mut reads = self.inner.reads.lock();
+        if reads.len() >= MAX_TOPICS {
+            return Err(BrokerError::TooManyChannels(MAX_TOPICS));
+        }
+        let mut read = Read { topic, name, sender, options, types: BTreeSet::new() };
+        read.follow(&self.inner);
+        reads.push(read);
+        Ok(subscription)
     }
 
-    /// Delivers what was taken, as far as that goes within a second, then ends.
-    pub async fn close(&self) {
-        self.adapter.close().await;
+    async fn close(&self) {
+        self.inner.adapter.close().await;
+    }
+}
+
+impl Inner {
+    /// Readers and writers follow the endpoints of others.
+    fn follow(&self) {
+        let offers: Vec<Arc<Offer>> = self.offers.lock().iter().filter_map(Weak::upgrade).collect();
+        offers.iter().for_each(|offer| offer.follow(self));
+        self.reads.lock().retain_mut(|read| {
+            read.follow(self);
+            !read.sender.is_closed()
+        });
     }
 
-    fn topic(&self, topic: &RosTopic) -> Result<Topic, BrokerError> {
-        let refused =
-            |reason: String| BrokerError::Name { channel: topic.topic.to_string(), reason };
-        let name = RosName::of_topic(&topic.topic, &self.namespace)
-            .map_err(|error: InexpressibleName| refused(error.to_string()))?;
-        let type_name = type_to_dds(&topic.type_name)
-            .ok_or_else(|| refused(format!("{:?} is no type of ROS 2", topic.type_name)))?;
-        Ok(Topic {
-            name: name.to_dds().into(),
-            user: topic.topic.as_str().into(),
-            type_name: type_name.into(),
-            terms: Terms { marked: true, deadline: topic.deadline, lease: topic.lease },
-        })
+    fn name(&self, channel: &ChannelName) -> Result<(TopicName, RosName), BrokerError> {
+        let refused = |reason: String| BrokerError::Name { channel: channel.to_string(), reason };
+        let topic: TopicName =
+            channel.as_str().parse().map_err(|error| refused(format!("it {error}")))?;
+        let name = RosName::of_topic(&topic, &self.namespace)
+            .map_err(|error| refused(error.to_string()))?;
+        Ok((topic, name))
+    }
+
+    /// What a writer is to offer, so that all readers of a topic and type are served.
+    fn offered(&self, name: &RosName, type_name: &str, published_reliable: bool) -> Offered {
+        let readers = self.knowledge.endpoints(name, false);
+        let of_type = readers.iter().filter(|it| it.type_name.as_deref() == Some(type_name));
+        Offered::to(published_reliable, of_type.map(Arc::as_ref))
+    }
+
+    /// A DDS writer; `None` where ROS 2 can have no such type, or the broker is closed.
+    fn writer(
+        &self,
+        name: &RosName,
+        topic: &TopicName,
+        type_name: &str,
+        terms: Terms,
+        options: PublisherOptions,
+    ) -> Option<TopicPublisher> {
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, terms);
+        self.adapter.publisher(topic, options).ok()
+    }
+}
+
+impl Read {
+    /// Makes readers for types that writers have now.
+    fn follow(&mut self, inner: &Inner) {
+        for writer in inner.knowledge.endpoints(&self.name, true) {
+            let is_readable = writer.type_name.is_some() && !writer.is_keyed;
+            if !is_readable || self.types.contains(&writer.dds_type) {
+                continue;
+            }
+            let terms = Terms { marked: true, ..Terms::default() };
+            let topic = dds_topic(&self.name, &self.topic, &writer.dds_type, terms);
+            match inner.adapter.read(topic, self.sender.clone(), self.options) {
+                Ok(()) => _ = self.types.insert(writer.dds_type.clone()),
+                Err(error) => tracing::warn!(topic = %self.topic, %error, "not read"),
+            }
+        }
+    }
+}
+
+fn dds_topic(name: &RosName, topic: &TopicName, dds_type: &str, terms: Terms) -> Topic {
+    Topic {
+        name: name.to_dds().into(),
+        user: topic.as_str().into(),
+        type_name: dds_type.into(),
+        terms,
     }
 }

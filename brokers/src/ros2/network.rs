@@ -10,6 +10,7 @@ use tokio::sync::watch;
 
 use super::endpoint::RosEndpoint;
 use super::graph::ParticipantNodes;
+use super::names::RosName;
 use crate::dds::adapter::Admission;
 use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix};
 
@@ -128,6 +129,13 @@ impl Knowledge {
     /// What is known of a writer.
     pub(super) fn writer(&self, id: &EndpointId) -> Option<Arc<RosEndpoint>> {
         self.state.lock().endpoints.get(id).map(|entry| Arc::clone(&entry.endpoint))
+    }
+
+    /// The writers or readers of a topic, whether or not they count yet.
+    pub(super) fn endpoints(&self, name: &RosName, writers: bool) -> Vec<Arc<RosEndpoint>> {
+        let state = self.state.lock();
+        let all = state.endpoints.values().map(|entry| &entry.endpoint);
+        all.filter(|it| it.is_writer == writers && it.name == *name).cloned().collect()
     }
 
     fn publish(&self, state: &State, now: Instant) {

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use rustdds::Timestamp;
 
-use super::Decoded;
+use super::NoMessage;
 use super::channel::Channel;
 use super::kept::History;
 use super::seen::{Moment, Seen};
@@ -98,9 +98,9 @@ pub(super) fn deliver(
         return;
     }
     let content = match shared.dialect.decode(&channel.topic, sample) {
-        Decoded::Message(content) => content,
-        Decoded::NotForUs => return,
-        Decoded::Malformed => {
+        Ok(content) => content,
+        Err(NoMessage::NotForUs) => return,
+        Err(NoMessage::Malformed) => {
             shared.counts.lock().malformed += 1;
             tracing::debug!(topic = &*channel.topic.name, "a sample is malformed");
             return;

@@ -43,6 +43,7 @@ use super::{
 use crate::outbox::{Admission as OutboxAdmission, Body, LanePublisher};
 use crate::port::{
     BrokerError, BrokerStatus, Content, PublisherOptions, SubscribeOptions, Subscription,
+    SubscriptionSender,
 };
 use send::Target;
 use shared::Shared;
@@ -90,9 +91,8 @@ pub(crate) enum Admission {
     Later,
 }
 
-/// What a sample is to those who read its topic.
-pub(crate) enum Decoded {
-    Message(Content),
+/// Why a sample is no message to those who read its topic.
+pub(crate) enum NoMessage {
     /// It is for other readers.
     NotForUs,
     Malformed,
@@ -132,7 +132,10 @@ pub(crate) trait Dialect: Send + Sync + 'static {
     }
 
     /// What a sample of another participant holds, or what an own writer keeps.
-    fn decode(&self, topic: &Topic, sample: &Sample) -> Decoded;
+    ///
+    /// # Errors
+    /// [`NoMessage`] where it is none.
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Content, NoMessage>;
 
     /// The sample of a message. `durable`: it is kept for late joiners.
     ///
@@ -204,7 +207,7 @@ impl Adapter {
     }
 
     /// Whether topics can be read and written now.
-    fn check_up(&self) -> Result<(), BrokerError> {
+    pub(crate) fn check_up(&self) -> Result<(), BrokerError> {
         self.check_open()?;
         if self.shared.is_up() { Ok(()) } else { Err(self.shared.away()) }
     }
@@ -254,6 +257,19 @@ impl Adapter {
             lane: self.shared.outbox.lane(target, Some(longest_wait)),
             admission: Arc::clone(&self.shared),
         }
+    }
+
+    /// Reads a topic for somebody who reads others, too.
+    pub(crate) fn read(
+        &self,
+        topic: Topic,
+        sender: SubscriptionSender,
+        options: SubscribeOptions,
+    ) -> Result<(), BrokerError> {
+        // It is made by the lifecycle thread; nobody waits for that.
+        self.shared.channels.add(topic, sender, options)?;
+        self.shared.wake_lifecycle();
+        Ok(())
     }
 
     /// Reads a topic.
