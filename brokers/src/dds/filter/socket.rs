@@ -120,13 +120,24 @@ fn still_bound(duplicate: OwnedFd, port: u16) -> Option<Socket> {
 fn attach_one(socket: &Socket, samples: Samples, is_small: &mut bool) -> Result<(), FilterError> {
     let [large, small] = Shape::both(samples);
     if !*is_small {
-        match socket.attach_filter(&filters(large, samples)?) {
-            Ok(()) => return Ok(()),
-            Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => *is_small = true,
-            Err(error) => return Err(system("the filter was refused")(error)),
+        let large = filters(large, samples)?;
+        let mut attached = socket.attach_filter(&large);
+        if is_no_room(&attached) {
+            // Another participant of this process and domain has the multicast sockets, too: their
+            // filter counts beside the new one until it is gone. It has none for some microseconds.
+            let _ = socket.detach_filter();
+            attached = socket.attach_filter(&large);
         }
+        if !is_no_room(&attached) {
+            return attached.map_err(system("the filter was refused"));
+        }
+        *is_small = true;
     }
     socket.attach_filter(&filters(small, samples)?).map_err(system("the filter was refused"))
+}
+
+fn is_no_room(attached: &std::io::Result<()>) -> bool {
+    attached.as_ref().is_err_and(|error| Errno::from_io_error(error) == Some(Errno::NOMEM))
 }
 
 fn filters(shape: Shape, samples: Samples) -> Result<Vec<SockFilter>, FilterError> {

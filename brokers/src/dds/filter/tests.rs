@@ -485,3 +485,14 @@ fn what_other_implementations_send_passes_only_where_they_are_expected() {
         assert!(!passes_of(ANY_VENDOR, &message(&[e.data_frag(1, 1, 255, 1024)])));
     }
 }
+
+/// As the multicast sockets of two participants of one process.
+#[test]
+fn a_socket_that_has_a_filter_gets_the_large_one_again() {
+    let receiver = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let port = receiver.local_addr().unwrap().port();
+    for samples in [SAMPLES, ANY_VENDOR, SAMPLES] {
+        let first = attach(&[port], samples).unwrap().is_small;
+        assert_eq!(attach(&[port], samples).unwrap().is_small, first);
+    }
+}
