@@ -18,7 +18,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::thread::JoinHandle;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{DdsError, GuidPrefix, Profile, Relay, RelayConfig, Writer};
 use blaze_domain::node_file::Chunking;
