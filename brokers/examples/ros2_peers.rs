@@ -6,18 +6,23 @@
 //! ros2_peers DOMAIN serve SECONDS     answers rq/basic_typesRequest, with the identity of the request in the reply
 //! ros2_peers DOMAIN call COUNT        calls rq/basic_typesRequest and looks for its identity in the replies
 //! ros2_peers DOMAIN watch SECONDS     prints the endpoints of others
+//! ros2_peers DOMAIN adapter SECONDS   rt/big -> rt/big_reply through the adapter, and prints what it knows of others
 //! ```
 //!
 //! All on 127.0.0.1. Figures of runs against Fast DDS and Cyclone: `docs/design/ros2.md`.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::net::Ipv4Addr;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
     Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer, Written,
 };
+use blaze_brokers::ros2::{GidLength, Ros2Broker, Ros2Config};
+use blaze_brokers::{Broker as _, Content, Health, Publisher, PublisherOptions, SubscribeOptions};
 use bytes::{BufMut, BytesMut};
 use rustdds::WriteOptionsBuilder;
 use rustdds::rpc::SampleIdentity;
@@ -34,6 +39,10 @@ fn main() -> Result<(), Error> {
     let [domain, task, count] = &arguments[..] else {
         return Err("usage: ros2_peers DOMAIN echo|late|serve|call|watch SECONDS|COUNT".into());
     };
+    if task == "adapter" {
+        let runtime = tokio::runtime::Runtime::new()?;
+        return runtime.block_on(adapter(domain.parse()?, Duration::from_secs(count.parse()?)));
+    }
     let mut config = ParticipantConfig::new(domain.parse()?, Ipv4Addr::LOCALHOST);
     config.largest_sample = 16 << 20;
     config.repairs_fragments = true;
@@ -226,5 +235,66 @@ fn watch(participant: &Participant, time: Duration) -> Result<(), Error> {
             );
         }
     }
+    Ok(())
+}
+
+/// Echoes what owned writers publish, through the adapter.
+async fn adapter(domain: u16, time: Duration) -> Result<(), Error> {
+    let network = Ros2Broker::open(Ros2Config {
+        flow: "edge/robot-1".parse()?,
+        domain,
+        interface: Ipv4Addr::LOCALHOST,
+        namespace: String::new(),
+        peers: Vec::new(),
+        gid: GidLength::Short,
+    })?;
+    let until = tokio::time::Instant::now() + time;
+    let mut status = network.status();
+    status.wait_for(|status| status.health == Health::Up).await?;
+    let publisher = |depth| -> Result<Arc<dyn Publisher>, Error> {
+        let options = PublisherOptions { reliable: true, large: true, depth };
+        Ok(network.publisher(&"big_reply".parse()?, options)?)
+    };
+    let mut publishers = HashMap::<u32, Arc<dyn Publisher>>::new();
+    let ask = SubscribeOptions { large: true, with_kept: true, ..SubscribeOptions::default() };
+    let mut subscription = network.subscribe(&"big".parse()?, ask).await?;
+    let mut found = network.network();
+    let mut numbers = HashMap::<_, Numbers>::new();
+    let mut batch = Vec::new();
+    loop {
+        tokio::select! {
+            () = tokio::time::sleep_until(until) => break,
+            _ = found.changed() => {
+                let endpoints = Arc::clone(&found.borrow_and_update());
+                let writers = endpoints.endpoints.iter().filter(|it| it.is_writer);
+                network.set_owned(writers.map(|it| (it.id, true)).collect());
+            }
+            _ = subscription.receive(&mut batch, 64) => {
+                for received in batch.drain(..) {
+                    let Content::Frame(frame) = received.content else { continue };
+                    let numbers = numbers.entry(frame.origin_service().to_owned()).or_default();
+                    numbers.note(i64::try_from(frame.sequence())?);
+                    let depth = frame.depth();
+                    if let Entry::Vacant(vacant) = publishers.entry(depth) {
+                        vacant.insert(publisher(depth)?);
+                    }
+                    publishers[&depth].publish(&frame, None);
+                }
+            }
+        }
+    }
+    for it in &network.network().borrow().endpoints {
+        let node = it.node.as_deref().unwrap_or("?");
+        println!("{} {} of {node} ({})", it.name, it.dds_type, it.vendor.as_str());
+    }
+    for (service, numbers) in numbers {
+        print!("{service}: ");
+        numbers.print();
+    }
+    println!("{:?}, lost {}", network.counts(), subscription.take_dropped());
+    for (depth, publisher) in publishers {
+        println!("depth {depth}: {:?}", publisher.later());
+    }
+    network.close().await;
     Ok(())
 }

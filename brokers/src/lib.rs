@@ -15,6 +15,7 @@ mod pending;
 pub mod port;
 pub mod redis;
 pub mod retained;
+pub mod ros2;
 mod wake;
 mod worker_side;
 

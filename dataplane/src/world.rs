@@ -4,11 +4,14 @@
 //! reads it.
 
 use std::collections::BTreeMap;
+use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_domain::node_file::{AccessRules, AutoBool};
-use blaze_domain::{Durability, FlowId, LayerKind, LayerName, Priority, Reliability, TopicName};
+use blaze_domain::{
+    Durability, FlowId, LayerKind, LayerName, Priority, Reliability, Scope, TopicName,
+};
 use blaze_proto::link::link_control::State;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -40,6 +43,8 @@ pub struct FlowView {
     /// The layer broker that it uses: flows of one layer with equal values share it. `None`: it has
     /// none.
     pub layer_scope: Option<LayerScopeId>,
+    /// The ROS 2 network that it is on, if any.
+    pub ros2: Option<Ros2Network>,
     /// What its local services advertise and request.
     pub topics: BTreeMap<TopicName, TopicEntry>,
     /// It has been ready for as long as it takes to be given what others carry ([`SETTLED_AFTER`]).
@@ -65,6 +70,7 @@ impl FlowView {
             reach: Reach::Up,
             node_scope: false,
             layer_scope: None,
+            ros2: None,
             topics: BTreeMap::new(),
             settled: false,
             parts: BTreeMap::new(),
@@ -190,11 +196,43 @@ impl LayerScopeId {
     }
 
     fn of(text: &str) -> Self {
-        let digest = Sha256::digest(text);
-        let mut id = [0; 8];
-        id.copy_from_slice(&digest[..8]);
-        Self(u64::from_le_bytes(id).max(1))
+        Self(stable_id(text))
     }
+}
+
+/// The same for a text in every flow and version, and never 0.
+fn stable_id(text: &str) -> u64 {
+    let digest = Sha256::digest(text);
+    let mut id = [0; 8];
+    id.copy_from_slice(&digest[..8]);
+    u64::from_le_bytes(id).max(1)
+}
+
+/// Identity of a ROS 2 network: flows of one layer with the same value share it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Ros2NetworkId(pub u64);
+
+impl Ros2NetworkId {
+    /// Identity of the network of a layer in this DDS domain.
+    #[must_use]
+    pub fn of_layer(domain: u16, layer: &LayerName) -> Self {
+        Self(stable_id(&format!("ros2|{domain}|layer {layer}")))
+    }
+
+    /// The same on loopback, where all flows of a host share it, whatever their layers are.
+    #[must_use]
+    pub fn of_host(domain: u16, host: &str) -> Self {
+        Self(stable_id(&format!("ros2|{domain}|host {host}")))
+    }
+}
+
+/// Where a flow is on a ROS 2 network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Ros2Network {
+    /// Which network.
+    pub id: Ros2NetworkId,
+    /// Address of its interface there: it owns the writers that have it among their locators.
+    pub address: Ipv4Addr,
 }
 
 /// What a flow says of itself: it begins, is ready, and goes, never the other way round in one
@@ -239,6 +277,9 @@ pub struct TopicEntry {
     pub node: ScopeEntry,
     /// Services on the layer scope (every flow that shares the layer broker has the same).
     pub layer: ScopeEntry,
+    /// Writers of the ROS 2 network that the flow owns, and readers of the network (every flow on
+    /// it has the same).
+    pub ros2: ScopeEntry,
     /// What a gateway says that flows of other groups advertise and request, merged; for flows that
     /// are none.
     pub outside: ScopeEntry,
@@ -247,7 +288,18 @@ pub struct TopicEntry {
 impl TopicEntry {
     /// Whether anybody asks for it.
     pub(crate) fn is_requested(&self) -> bool {
-        [&self.node, &self.layer, &self.outside].iter().any(|scope| scope.request.is_some())
+        self.scopes().iter().any(|(_, scope)| scope.request.is_some())
+    }
+
+    /// What is said of each scope; what a gateway tells of flows outside is of its inter scope.
+    #[must_use]
+    pub fn scopes(&self) -> [(Scope, &ScopeEntry); 4] {
+        [
+            (Scope::Node, &self.node),
+            (Scope::Layer, &self.layer),
+            (Scope::Ros2, &self.ros2),
+            (Scope::Inter, &self.outside),
+        ]
     }
 }
 
@@ -331,6 +383,8 @@ pub struct Request {
     pub framed: bool,
     /// A service of this scope wants bare payloads.
     pub bare: bool,
+    /// A service of this scope wants payloads as JSON.
+    pub json: bool,
 }
 
 /// Only messages of that origin; an absent part matches everything.

@@ -77,6 +77,12 @@ impl FlowId {
     pub fn new(layer: LayerName, node: NodeName) -> Self {
         Self { layer, node }
     }
+
+    /// Whether a text is this flow's name.
+    #[must_use]
+    pub fn is_written(&self, text: &str) -> bool {
+        text.split_once('/') == Some((self.layer.as_str(), self.node.as_str()))
+    }
 }
 
 impl fmt::Display for FlowId {
@@ -122,6 +128,7 @@ mod tests {
     fn a_flow_survives_its_text() {
         let flow: FlowId = "edge/robot-1".parse().unwrap();
         assert_eq!(flow.to_string(), "edge/robot-1");
+        assert!(flow.is_written("edge/robot-1") && !flow.is_written("edge/robot-12"));
         assert!("edge".parse::<FlowId>().is_err());
     }
 }

@@ -15,6 +15,10 @@ use crate::control::REPLY_PREFIX;
 pub const MAX_NAME_BYTES: usize = 63;
 /// Longest topic name, in bytes.
 pub const MAX_TOPIC_BYTES: usize = 200;
+/// Before the topic, the channel of its payloads without a header.
+const BARE_PREFIX: &str = "blaze/bare/";
+/// Before the topic, the channel of its payloads as JSON.
+const JSON_PREFIX: &str = "blaze/json/";
 
 /// Why a text is not a name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -95,12 +99,9 @@ fn check_topic(text: &str) -> Result<(), NameError> {
 }
 
 fn check_channel(text: &str) -> Result<(), NameError> {
-    // `blaze/bare/<topic>` is a channel of its own and may be longer than the topic that it
-    // carries.
-    match text.strip_prefix("blaze/bare/") {
-        Some(topic) => check_topic_form(topic),
-        None => check_topic_form(text),
-    }
+    // Channels of copies may be longer than the topic that they carry.
+    let of_copies = [BARE_PREFIX, JSON_PREFIX].iter().find_map(|prefix| text.strip_prefix(prefix));
+    check_topic_form(of_copies.unwrap_or(text))
 }
 
 macro_rules! name {
@@ -221,6 +222,34 @@ impl InstanceName {
     }
 }
 
+impl ServiceName {
+    /// The service that stands for a ROS 2 node: its full name in lower case, with `-` for all
+    /// other characters; `ros2` while the name is not known.
+    ///
+    /// ```
+    /// use blaze_domain::ServiceName;
+    /// assert_eq!(ServiceName::of_ros2_node("/arm/Talker_1").as_str(), "arm-talker-1");
+    /// assert_eq!(ServiceName::of_ros2_node("").as_str(), "ros2");
+    /// ```
+    #[must_use]
+    pub fn of_ros2_node(full_name: &str) -> Self {
+        let mut name = String::new();
+        for c in full_name.chars() {
+            let is_good = c.is_ascii_alphanumeric();
+            if is_good {
+                name.push(c.to_ascii_lowercase());
+            } else if !name.is_empty() && !name.ends_with('-') {
+                name.push('-');
+            }
+            if name.len() >= MAX_NAME_BYTES {
+                break;
+            }
+        }
+        let name = name.trim_end_matches('-');
+        Self(Arc::from(if name.is_empty() { "ros2" } else { name }))
+    }
+}
+
 impl From<&TopicName> for ChannelName {
     fn from(topic: &TopicName) -> Self {
         Self(Arc::clone(&topic.0))
@@ -243,7 +272,13 @@ impl ChannelName {
     /// Where a topic is served to clients that want payloads without a header.
     #[must_use]
     pub fn bare(topic: &TopicName) -> Self {
-        Self(Arc::from(format!("blaze/bare/{topic}")))
+        Self(Arc::from(format!("{BARE_PREFIX}{topic}")))
+    }
+
+    /// Where a topic is served to clients that want payloads as JSON.
+    #[must_use]
+    pub fn json(topic: &TopicName) -> Self {
+        Self(Arc::from(format!("{JSON_PREFIX}{topic}")))
     }
 
     /// Where one life of a service gets its answers, on brokers that make channels as they are
@@ -288,6 +323,22 @@ mod tests {
     }
 
     #[test]
+    fn every_ros2_node_has_a_service_name() {
+        let long = format!("/{}_x", "a".repeat(62));
+        for (node, service) in [
+            ("/talker", "talker"),
+            ("/arm//__Talker_1__", "arm-talker-1"),
+            ("/ä/ö", "ros2"),
+            ("/é_1", "1"),
+            (long.as_str(), &"a".repeat(62)),
+        ] {
+            let name = ServiceName::of_ros2_node(node);
+            assert_eq!(name.as_str(), service, "{node}");
+            assert!(name.as_str().parse::<ServiceName>().is_ok());
+        }
+    }
+
+    #[test]
     fn topics_follow_the_contract() {
         for good in ["imu/data", "A_b-9/x", &"t".repeat(200)] {
             assert!(good.parse::<TopicName>().is_ok(), "{good}");
@@ -316,7 +367,8 @@ mod tests {
         for reply in [own, ChannelName::shared_reply()] {
             assert_eq!(reply.as_str().parse::<ChannelName>().unwrap(), reply);
         }
-        let bare = ChannelName::bare(&longest);
-        assert_eq!(bare.as_str().parse::<ChannelName>().unwrap(), bare);
+        for copies in [ChannelName::bare(&longest), ChannelName::json(&longest)] {
+            assert_eq!(copies.as_str().parse::<ChannelName>().unwrap(), copies);
+        }
     }
 }

@@ -73,10 +73,17 @@ word_enum!(
         Node = "node",
         /// Services and flows of one layer.
         Layer = "layer",
+        /// Nodes of one ROS 2 network.
+        Ros2 = "ros2",
         /// Flows of all layers.
         Inter = "inter",
     }
 );
+
+impl Scope {
+    /// Those that services or ROS 2 nodes are on; a flow has at most one broker of each.
+    pub const LOCAL: [Self; 3] = [Self::Node, Self::Layer, Self::Ros2];
+}
 
 word_enum!(
     /// Class of a topic on the inter scope; the smaller value goes first (`Control < State <

@@ -30,6 +30,8 @@ word_enum!(
         DecompressError = "decompress_error",
         /// Publisher and requester disagree about the type.
         TypeMismatch = "type_mismatch",
+        /// It could not be converted to the encoding that was asked for.
+        ConvertError = "convert_error",
         /// Parts of it never came.
         ReassemblyTimeout = "reassembly_timeout",
         /// The broker refused it or was away.
@@ -68,6 +70,10 @@ word_enum!(
         BridgeFailed = "bridge_failed",
         /// Publisher and requester disagree about the type.
         TypeMismatch = "type_mismatch",
+        /// Nobody has the definition of its type: it cannot be converted.
+        TypeUnknown = "type_unknown",
+        /// A message could not be converted.
+        ConvertError = "convert_error",
         /// More is asked than offered; it flows as offered.
         QosMismatch = "qos_mismatch",
         /// The broker cannot express the topic's name.
@@ -88,6 +94,8 @@ word_enum!(
         Lifespan = "lifespan",
         /// The broker does not answer.
         BrokerDown = "broker_down",
+        /// A ROS 2 endpoint that has no UDP address.
+        Unreachable = "unreachable",
         /// Another flow owns the scope.
         ScopeInUse = "scope_in_use",
         /// Several programs run under the name of one flow.

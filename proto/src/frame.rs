@@ -342,6 +342,18 @@ impl Frame {
         self.index.depth
     }
 
+    /// Of a reply: writer and sequence of the request that it answers.
+    #[must_use]
+    pub fn related(&self) -> Option<(WriterId, u64)> {
+        self.index.related_writer.map(|writer| (writer, self.index.related_sequence))
+    }
+
+    /// The flow, `layer/node`, that alone writes it to ROS 2; empty: any.
+    #[must_use]
+    pub fn to(&self) -> &str {
+        self.text(&self.index.to)
+    }
+
     /// Whether the payload is compressed (inter scope only).
     #[must_use]
     pub fn is_compressed(&self) -> bool {

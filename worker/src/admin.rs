@@ -56,7 +56,7 @@ impl Shown {
     ) -> std::io::Result<SocketAddr> {
         let broker = match scope {
             Scope::Node => "node_broker",
-            Scope::Layer | Scope::Inter => "layer_broker",
+            Scope::Layer | Scope::Ros2 | Scope::Inter => "layer_broker",
         };
         // Before anybody can ask: without them it would be ready.
         let (decides, shows) = (Gate::Decides, Gate::Shows);

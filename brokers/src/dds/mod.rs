@@ -19,7 +19,7 @@ mod fault;
 mod filter;
 pub mod layer;
 mod nudge;
-mod participant;
+pub(crate) mod participant;
 mod pulse;
 mod reader;
 mod relay;
@@ -49,6 +49,9 @@ pub const FRAME_TYPE: &str = "blaze::v1::Frame";
 
 /// RustDDS announces itself to this many participant slots of its own host.
 const LOCAL_SLOTS: u16 = 12;
+
+/// Slots of a host in one domain: the ports of the next domain follow.
+pub(crate) const SLOTS: u16 = 120;
 
 /// UDP port of a domain on which multicast announcements come; user multicast is the next one.
 fn multicast_port(domain: u16) -> u16 {

@@ -190,7 +190,7 @@ impl Profile {
 }
 
 /// A reader that nobody empties yet.
-pub(super) type RawReader = no_key::SimpleDataReader<Cdr, CdrAdapter>;
+pub(crate) type RawReader = no_key::SimpleDataReader<Cdr, CdrAdapter>;
 
 /// One participant. Dropping it says good-bye to the others and ends its threads, which may take a
 /// while when one of them hangs: drop it where that does not matter.
@@ -367,7 +367,7 @@ impl Participant {
     }
 
     /// Makes a reader of a topic, given with its type. It has no thread that empties it.
-    pub(super) fn raw_reader(
+    pub(crate) fn raw_reader(
         &self,
         topic: (&str, &str),
         profile: Profile,
@@ -445,6 +445,6 @@ fn contain<T>(
     }
 }
 
-pub(super) fn prefix_of(guid: rustdds::GUID) -> GuidPrefix {
+pub(crate) fn prefix_of(guid: rustdds::GUID) -> GuidPrefix {
     participant_of(&endpoint_of(guid))
 }

@@ -2,8 +2,9 @@
 //!
 //! RustDDS knows no initial peers. It does announce itself (SPDP) to the twelve participant slots
 //! of its own host, so the relay sits in one of them and repeats the announcement to the hosts that
-//! it knows. It also holds the two multicast ports of the domain, because RustDDS sends user data
-//! to a peer's multicast address as soon as the peer has one, and multicast does not cross routers.
+//! it knows, and to higher slots of its own. Between flows it also holds the two multicast ports of
+//! the domain, because RustDDS sends user data to a peer's multicast address as soon as the peer
+//! has one, and multicast does not cross routers.
 
 use std::collections::{BTreeSet, HashSet, VecDeque};
 use std::io;
@@ -17,13 +18,12 @@ use parking_lot::Mutex;
 
 use super::announcement::Announcement;
 use super::reader::StoppableThread;
-use super::{DdsError, GuidPrefix, LOCAL_SLOTS, announcement_port, multicast_port};
+use super::{DdsError, GuidPrefix, LOCAL_SLOTS, SLOTS, announcement_port, multicast_port};
 
 /// Most addresses that are announced to.
 const MAX_ADDRESSES: usize = 256;
 /// Announcements of other local participants that are kept until it is known which one is ours.
 const MAX_HEARD: usize = 16;
-const REPEAT: Duration = Duration::from_millis(500);
 const RETRY: Duration = Duration::from_secs(1);
 const RESOLVE: Duration = Duration::from_secs(10);
 /// How soon a new address is announced to, at the latest.
@@ -38,8 +38,15 @@ pub struct RelayConfig {
     pub address: Ipv4Addr,
     /// Addresses or names of other hosts. Those of this host are passed over.
     pub peers: Vec<String>,
-    /// DDS participants that may live on one host.
+    /// DDS participants that may live on one other host.
     pub slots: u16,
+    /// Participants of the own host that RustDDS does not announce itself to, because their slots
+    /// are too high, are announced to below this one.
+    pub own_slots: u16,
+    /// Whether the multicast ports of the domain are held, so that nothing goes by multicast.
+    pub holds_multicast: bool,
+    /// Time between two announcements to the same participant.
+    pub repeat: Duration,
 }
 
 /// What a relay does, for people.
@@ -214,7 +221,7 @@ impl Ports {
     /// Tries to get what is missing.
     fn take(&mut self, config: &RelayConfig, state: &Mutex<State>) {
         for (socket, port) in self.held.iter_mut().zip(multicast_port(config.domain)..) {
-            if socket.is_none() {
+            if socket.is_none() && config.holds_multicast {
                 *socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).ok();
             }
         }
@@ -235,8 +242,9 @@ impl Ports {
         status.holds_multicast_ports = self.held.iter().all(Option::is_some);
     }
 
-    fn complete(&self) -> bool {
-        self.held.iter().all(Option::is_some) && self.slot.is_some() && self.sender.is_some()
+    fn complete(&self, config: &RelayConfig) -> bool {
+        let holds = self.held.iter().all(Option::is_some) || !config.holds_multicast;
+        holds && self.slot.is_some() && self.sender.is_some()
     }
 }
 
@@ -260,13 +268,13 @@ fn run(config: &RelayConfig, state: &Mutex<State>, mut ports: Ports, stop: &Atom
             None => thread::park_timeout(LISTEN),
         }
         let now = Instant::now();
-        if now >= next_take && !ports.complete() {
+        if now >= next_take && !ports.complete(config) {
             ports.take(config, state);
             next_take = now + RETRY;
         }
         let repeat = now >= next_repeat;
         if repeat {
-            next_repeat = now + REPEAT;
+            next_repeat = now + config.repeat;
         }
         if let Some(sender) = &ports.sender {
             announce(config, state, sender, repeat);
@@ -305,10 +313,12 @@ fn announce(config: &RelayConfig, state: &Mutex<State>, sender: &UdpSocket, repe
         else {
             return;
         };
+        let own_host = (config.own_slots > LOCAL_SLOTS).then_some(&config.address);
         let targets: Vec<Ipv4Addr> = state
             .configured
             .iter()
             .chain(&state.learnt)
+            .chain(own_host)
             .filter(|address| !state.live.contains(*address))
             .filter(|address| repeat || !state.told.contains(*address))
             .copied()
@@ -320,7 +330,12 @@ fn announce(config: &RelayConfig, state: &Mutex<State>, sender: &UdpSocket, repe
         (datagram, targets)
     };
     for address in targets {
-        for slot in 0..config.slots.min(LOCAL_SLOTS) {
+        let slots = if address == config.address {
+            LOCAL_SLOTS..config.own_slots.min(SLOTS)
+        } else {
+            0..config.slots.min(SLOTS)
+        };
+        for slot in slots {
             let sent = sender.send_to(&datagram, (address, announcement_port(config.domain, slot)));
             if let Err(error) = sent
                 && !REFUSED.swap(true, Ordering::Relaxed)

@@ -82,11 +82,11 @@ pub fn octet_sequence(parts: &[&[u8]]) -> io::Result<Cdr> {
 }
 
 /// Takes samples of any encoding from RustDDS, and gives it those in little-endian CDR.
-pub(super) struct CdrAdapter;
+pub(crate) struct CdrAdapter;
 
 /// The decoder of [`CdrAdapter`].
 #[derive(Clone)]
-pub(super) struct CdrDecoder;
+pub(crate) struct CdrDecoder;
 
 static ENCODINGS: [RepresentationIdentifier; 8] = [
     RepresentationIdentifier::CDR_LE,

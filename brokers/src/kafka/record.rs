@@ -83,6 +83,16 @@ fn read_field(header: &mut Header, name: &str, value: Option<&[u8]>) -> Result<(
         "blaze-hops" => header.hops = number("blaze-hops", value)?,
         "blaze-lifespan-ms" => header.lifespan_ms = number("blaze-lifespan-ms", value)?,
         "blaze-depth" => header.depth = number("blaze-depth", value)?,
+        "blaze-to" => text("blaze-to", value)?.clone_into(&mut header.to),
+        "blaze-related-sequence" => {
+            header.related.get_or_insert_default().1 = number("blaze-related-sequence", value)?;
+        }
+        "blaze-related-writer" => {
+            let Ok(writer) = text("blaze-related-writer", value)?.parse() else {
+                return field("blaze-related-writer", "is not 32 hexadecimal digits");
+            };
+            header.related.get_or_insert_default().0 = writer;
+        }
         "blaze-type-hash" => text("blaze-type-hash", value)?.clone_into(&mut header.type_hash),
         "traceparent" => text("traceparent", value)?.clone_into(&mut header.traceparent),
         "blaze-priority" => match text("blaze-priority", value)?.parse::<Priority>() {
@@ -169,6 +179,13 @@ pub(super) fn write(frame: &Frame, scratch: &mut String, mut add: impl FnMut(&'s
     if !frame.type_hash().is_empty() {
         put("blaze-type-hash", format_args!("{}", frame.type_hash()));
     }
+    if let Some((writer, sequence)) = frame.related() {
+        put("blaze-related-writer", format_args!("{writer}"));
+        put("blaze-related-sequence", format_args!("{sequence}"));
+    }
+    if !frame.to().is_empty() {
+        put("blaze-to", format_args!("{}", frame.to()));
+    }
     if !frame.traceparent().is_empty() {
         put("traceparent", format_args!("{}", frame.traceparent()));
     }
@@ -176,7 +193,7 @@ pub(super) fn write(frame: &Frame, scratch: &mut String, mut add: impl FnMut(&'s
 
 /// As [`write()`], into what the client library takes.
 pub(super) fn headers(frame: &Frame, scratch: &mut String) -> OwnedHeaders {
-    let mut headers = Some(OwnedHeaders::new_with_capacity(14));
+    let mut headers = Some(OwnedHeaders::new_with_capacity(18));
     write(frame, scratch, |key, value| {
         headers = headers
             .take()

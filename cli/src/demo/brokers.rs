@@ -39,7 +39,7 @@ impl NodeBrokers {
     pub(super) fn of_services(&self, scope: Scope) -> &Arc<dyn Broker> {
         match scope {
             Scope::Node => &self.services_node,
-            Scope::Layer | Scope::Inter => &self.services_layer,
+            Scope::Layer | Scope::Ros2 | Scope::Inter => &self.services_layer,
         }
     }
 

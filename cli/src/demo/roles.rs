@@ -124,7 +124,7 @@ impl Consumer {
     pub fn spot(&self) -> Spot {
         match scope_of(self.service, self.node) {
             Scope::Node => Spot::Node(self.node),
-            Scope::Layer | Scope::Inter => Spot::Layer(self.node.layer().to_owned()),
+            Scope::Layer | Scope::Ros2 | Scope::Inter => Spot::Layer(self.node.layer().to_owned()),
         }
     }
 }

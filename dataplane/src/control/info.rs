@@ -7,15 +7,15 @@ use blaze_domain::{Durability, FlowId, MAX_PAYLOAD_BYTES, Reliability, Scope, To
 
 use crate::lane::path::{BareInfo, TopicInfo};
 use crate::registry::{LeaseView, Registry, Terms};
-use crate::world::{FlowView, OriginFilter};
+use crate::world::{FlowView, OriginFilter, TopicEntry};
 
 /// The largest payload in bytes that any flow announces of a topic. Of which connection a message
 /// goes to its broker is decided by that where it arrives as well: a flow whose own services only
 /// ask for it has no other way to know before one has come.
 pub(super) fn announced_bytes(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> Option<u64> {
     let entries = holders.iter().filter_map(|(_, view)| view.topics.get(topic));
-    let scopes = entries.flat_map(|entry| [&entry.node, &entry.layer, &entry.outside]);
-    let largest = scopes.filter_map(|scope| scope.advertise.as_ref()?.max_bytes).max();
+    let scopes = entries.flat_map(TopicEntry::scopes);
+    let largest = scopes.filter_map(|(_, scope)| scope.advertise.as_ref()?.max_bytes).max();
     largest.map(|bytes| bytes.min(MAX_PAYLOAD_BYTES as u64))
 }
 
@@ -57,12 +57,12 @@ pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicNam
         let Some(entry) = view.topics.get(topic) else {
             continue;
         };
-        let layer = || Some(flow.layer.to_string());
         // What a gateway tells of flows outside names no layers.
-        let scopes = [(layer(), &entry.node), (layer(), &entry.layer), (None, &entry.outside)];
-        let offers = scopes
+        let layer = |scope| (scope != Scope::Inter).then(|| flow.layer.to_string());
+        let offers = entry
+            .scopes()
             .into_iter()
-            .filter_map(|(layer, scope)| Some((layer, scope.advertise.as_ref()?)));
+            .filter_map(|(scope, entry)| Some((layer(scope), entry.advertise.as_ref()?)));
         for (layer, offer) in
             offers.filter(|(_, offer)| offer.durability == Durability::TransientLocal)
         {

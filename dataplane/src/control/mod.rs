@@ -16,6 +16,7 @@ mod info;
 mod output;
 mod planning;
 mod replicas;
+mod ros2;
 mod routes;
 mod scopes;
 
@@ -43,8 +44,9 @@ pub use output::{ControlConfig, Output};
 use planning::Dirty;
 use replicas::Replicas;
 pub use replicas::read_replica_message;
+use ros2::Ros2;
 pub use scopes::ScopeHealth;
-use scopes::{LOCAL, Scopes};
+use scopes::Scopes;
 
 /// A changed topic is planned after this much quiet …
 pub const QUIET: Duration = Duration::from_millis(50);
@@ -70,6 +72,7 @@ pub struct ControlCore {
     /// Who advertises which topic as transient_local, in any flow.
     durable: BTreeMap<TopicName, BTreeSet<OriginFilter>>,
     replicas: Replicas,
+    ros2: Ros2,
     gateways: Gateways,
     carriers: Carriers,
     balance: Balance,
@@ -107,6 +110,7 @@ impl ControlCore {
             gateways,
             carriers: Carriers::default(),
             balance: Balance::default(),
+            ros2: Ros2::default(),
             config,
             registry,
             plans: BTreeMap::new(),
@@ -259,7 +263,7 @@ impl ControlCore {
         self.follow_choice(now);
         self.tell_layer_away(now);
         let listened = self.has_listened(now);
-        let knows_leases = !LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
+        let knows_leases = !Scope::LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
         if self.state == FlowState::Starting && listened && knows_leases && self.knows_replicas(now)
         {
             self.set_state(now, FlowState::Ready);
@@ -275,6 +279,7 @@ impl ControlCore {
         self.save_leases();
         let changed = self.registry.watch_flows(now);
         self.touch(now, changed);
+        self.follow_ros2(now);
         self.hurry(now);
         if now.saturating_duration_since(self.reconciled) >= RECONCILE {
             self.reconciled = now;

@@ -15,7 +15,7 @@ use super::Duty;
 use crate::lane::path::TopicInfo;
 use crate::plan::{PlanRules, TopicPlan};
 use crate::registry::{LayerNames, UnsavedLease};
-use crate::world::{FlowState, LayerScopeId, OriginFilter};
+use crate::world::{FlowState, LayerScopeId, OriginFilter, Ros2Network};
 
 /// What the control core wants done.
 #[derive(Debug)]
@@ -77,6 +77,8 @@ pub enum Output {
     },
     /// Say in Hello that the layer broker has not answered for some seconds, or that it does again.
     LayerAway(bool),
+    /// Say in Hello on which ROS 2 network this flow is.
+    Ros2(Option<Ros2Network>),
     /// Let the broker of a scope keep or forget a lease.
     SaveLease(UnsavedLease),
     /// Forget what is kept of writers for late joiners: their service no longer advertises the

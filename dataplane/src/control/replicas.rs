@@ -228,6 +228,7 @@ impl ControlCore {
             AutoBool::No => Gateway::Never,
         };
         let load = self.balance.own;
+        let ros2 = self.registry.world().own().and_then(|own| own.ros2);
         Hello {
             layer: self.config.me.layer.to_string(),
             node: self.config.me.node.to_string(),
@@ -247,6 +248,8 @@ impl ControlCore {
             ingress_bytes_per_s: Some(load.in_bytes_per_s),
             link_peers: self.registry.link_peers(),
             heard_ms: self.registry.heard_ms(),
+            ros2_network: ros2.map_or(0, |network| network.id.0),
+            ros2_address: ros2.map(|network| network.address.to_string()).unwrap_or_default(),
             ..Hello::default()
         }
     }

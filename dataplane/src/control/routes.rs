@@ -15,7 +15,9 @@ pub(super) fn route_states(
     let carried = plan.bridges.iter().map(|bridge| {
         let (to_layer, receiver) = match &bridge.to {
             Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string()),
-            Target::Node { .. } | Target::Layer => (me.layer.to_string(), me.to_string()),
+            Target::Node(_) | Target::Layer { .. } | Target::Ros2 => {
+                (me.layer.to_string(), me.to_string())
+            }
         };
         let (step, code) = state_of(bridge, &health);
         RouteState {
@@ -49,11 +51,8 @@ pub(super) fn route_states(
 
 /// The step that a bridge is at, and what is wrong with it.
 fn state_of(bridge: &Bridge, health: impl Fn(Scope) -> ScopeHealth) -> (&'static str, WhyCode) {
-    let (step, target) = match &bridge.to {
-        Target::Inter { .. } => ("bridge", Scope::Inter),
-        Target::Node { .. } => ("deliver", Scope::Node),
-        Target::Layer => ("deliver", Scope::Layer),
-    };
+    let target = bridge.to.scope();
+    let step = if target == Scope::Inter { "bridge" } else { "deliver" };
     match (health(bridge.from).fault(), health(target).fault()) {
         (Some(code), _) => ("bridge", code),
         (None, Some(code)) => (step, code),

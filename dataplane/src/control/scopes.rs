@@ -12,9 +12,6 @@ use super::{ControlCore, Output};
 use crate::plan::{Bridge, Target};
 use crate::registry::Restored;
 
-/// The local scopes.
-pub(super) const LOCAL: [Scope; 2] = [Scope::Node, Scope::Layer];
-
 /// Others are told of a layer broker that has not answered for this long: it is as long as they
 /// need to notice that a flow has died.
 const AWAY: Duration = Duration::from_millis(2500);
@@ -48,7 +45,7 @@ impl ScopeHealth {
 pub(super) struct Scopes {
     health: BTreeMap<Scope, ScopeHealth>,
     /// Channels in use on brokers with a flow's side, with their depth.
-    prepared: BTreeMap<(Scope, TopicName), u32>,
+    prepared: BTreeMap<(Scope, ChannelName), u32>,
     /// Since when the layer broker has not answered.
     layer_away: Option<Instant>,
     /// Whether others are told so.
@@ -128,32 +125,42 @@ impl ControlCore {
     /// Lets brokers make the channels of topics that are leased on them or that a bridge writes,
     /// and release the others.
     pub(super) fn update_channels(&mut self, topic: &TopicName) {
-        for scope in LOCAL {
+        for scope in Scope::LOCAL {
             if !self.config.lease_stores.contains(&scope) {
                 continue;
             }
             let leased = self.registry.channel_depth(topic, scope);
             let bridges = self.plans.get(topic).map_or(&[][..], |plan| &plan.bridges);
             let written = bridges.iter().filter(|bridge| writes(bridge, scope)).map(depth_of).max();
-            let wanted = leased.max(written);
-            let key = (scope, topic.clone());
-            if self.scopes.prepared.get(&key).copied() == wanted {
-                continue;
+            let released =
+                self.update_channel(scope, ChannelName::from(topic), leased.max(written));
+            if released && scope == Scope::Layer {
+                self.registry.forget_foreign_name(topic);
             }
-            let channel = ChannelName::from(topic);
-            match wanted {
-                Some(depth) => {
-                    self.scopes.prepared.insert(key, depth);
-                    self.outputs.push_back(Output::Prepare { scope, channel, depth });
-                }
-                None => {
-                    self.scopes.prepared.remove(&key);
-                    if scope == Scope::Layer {
-                        self.registry.forget_foreign_name(topic);
-                    }
-                    self.outputs.push_back(Output::Release { scope, channel });
-                }
-            }
+        }
+        if self.config.lease_stores.contains(&Scope::Layer) {
+            let leased = self.registry.wants_json(topic, Scope::Layer).then_some(0);
+            let bridges = self.plans.get(topic).map_or(&[][..], |plan| &plan.bridges);
+            let copies = bridges.iter().filter(|bridge| bridge.to == Target::Layer { json: true });
+            let wanted = leased.max(copies.map(depth_of).max());
+            self.update_channel(Scope::Layer, ChannelName::json(topic), wanted);
+        }
+    }
+
+    /// The same for one channel. Whether it was released.
+    fn update_channel(&mut self, scope: Scope, channel: ChannelName, wanted: Option<u32>) -> bool {
+        let key = (scope, channel.clone());
+        if self.scopes.prepared.get(&key).copied() == wanted {
+            return false;
+        }
+        if let Some(depth) = wanted {
+            self.scopes.prepared.insert(key, depth);
+            self.outputs.push_back(Output::Prepare { scope, channel, depth });
+            false
+        } else {
+            self.scopes.prepared.remove(&key);
+            self.outputs.push_back(Output::Release { scope, channel });
+            true
         }
     }
 
@@ -166,11 +173,7 @@ impl ControlCore {
 }
 
 fn writes(bridge: &Bridge, scope: Scope) -> bool {
-    match bridge.to {
-        Target::Node { bare } => scope == Scope::Node && !bare,
-        Target::Layer => scope == Scope::Layer,
-        Target::Inter { .. } => false,
-    }
+    bridge.to.scope() == scope && !bridge.to.is_headless()
 }
 
 fn depth_of(bridge: &Bridge) -> u32 {

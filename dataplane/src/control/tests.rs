@@ -3,6 +3,7 @@
 mod balance;
 mod gateways;
 mod replicas;
+mod ros2;
 
 use blaze_domain::LayerKind;
 use blaze_domain::node_file::{AccessRules, AutoBool};
@@ -43,7 +44,7 @@ impl Bench {
             inter_scope: false,
             layer_answers_need_id: true,
             layer_names: LayerNames::Kafka { prefix: String::new() },
-            lease_stores: BTreeSet::from(LOCAL),
+            lease_stores: BTreeSet::from([Scope::Node, Scope::Layer]),
             rules: PlanRules::default(),
             access: AccessRules::default(),
         });
@@ -52,7 +53,7 @@ impl Bench {
 
     /// Nothing is kept by its brokers.
     fn read_leases(&mut self) {
-        for scope in LOCAL {
+        for scope in Scope::LOCAL {
             self.core.restore_leases(self.now, scope, &[]);
         }
     }
@@ -137,7 +138,7 @@ impl Bench {
 
     fn bridges(&self, topic: &str) -> Vec<String> {
         let plan = self.core.plans().get(&topic.parse::<TopicName>().unwrap());
-        let text = |bridge: &Bridge| format!("{}>{:?}", bridge.from, bridge.to);
+        let text = |bridge: &Bridge| format!("{}>{}", bridge.from, bridge.to.scope());
         plan.iter().flat_map(|plan| &plan.bridges).map(text).collect()
     }
 
@@ -180,7 +181,7 @@ fn a_flow_is_starting_until_all_kept_leases_are_read() {
     bench.step(20);
     assert_eq!(bench.core.state(), FlowState::Ready);
     bench.step(300);
-    assert_eq!(bench.bridges("imu/data"), ["node>Layer"]);
+    assert_eq!(bench.bridges("imu/data"), ["node>layer"]);
     let other = |output: &Output| {
         matches!(output, Output::Publish { .. }) && !format!("{output:?}").contains("route_up")
     };
@@ -229,7 +230,7 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
     let kept = [("request|t|fog||a|0".to_owned(), value)];
     bench.core.restore_leases(bench.now, Scope::Layer, &kept);
     bench.step(300);
-    assert_eq!(bench.bridges("t"), ["node>Layer"]);
+    assert_eq!(bench.bridges("t"), ["node>layer"]);
     bench.outputs.clear();
     bench.core.set_scope_health(bench.now, Scope::Node, ScopeHealth::InUse);
     bench.step(300);
@@ -252,7 +253,7 @@ fn changes_without_end_hold_up_no_plan_for_longer_than_the_latest_time() {
         bench.send(Scope::Layer, &request);
         bench.step(pause.as_millis() as u64);
     }
-    assert_eq!(bench.bridges("t"), ["node>Layer"]);
+    assert_eq!(bench.bridges("t"), ["node>layer"]);
 }
 
 #[test]
@@ -299,6 +300,18 @@ fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
 }
 
 #[test]
+fn the_channel_of_json_copies_is_made_for_those_who_ask_for_them() {
+    let mut bench = Bench::ready();
+    let mut ask = lease("request", "odom");
+    ask["json"] = true.into();
+    bench.channels();
+    bench.send(Scope::Layer, &ask);
+    assert_eq!(bench.channels(), ["+layer odom 0", "+layer blaze/json/odom 0"]);
+    bench.send(Scope::Layer, &lease("withdraw", "odom"));
+    assert_eq!(bench.channels(), ["-layer odom", "-layer blaze/json/odom"]);
+}
+
+#[test]
 fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     let mut bench = Bench::ready();
     // Another node of the layer asks for `imu_data` of this node: only the way over Kafka is
@@ -311,7 +324,7 @@ fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     bench.link_says(hello, 1, vec![asks_for("imu_data")]);
     bench.send(Scope::Node, &lease("advertise", "imu_data"));
     bench.step(300);
-    assert_eq!(bench.bridges("imu_data"), ["node>Layer"]);
+    assert_eq!(bench.bridges("imu_data"), ["node>layer"]);
     bench.send(Scope::Node, &lease("withdraw", "imu_data"));
     bench.step(300);
     bench.send(Scope::Layer, &lease("advertise", "imu/data"));
@@ -324,7 +337,7 @@ fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     bench.send(Scope::Layer, &lease("withdraw", "imu/data"));
     bench.step(6000);
     bench.step(300);
-    assert_eq!(bench.bridges("imu_data"), ["node>Layer"], "the name is free");
+    assert_eq!(bench.bridges("imu_data"), ["node>layer"], "the name is free");
 }
 
 #[test]
@@ -378,7 +391,7 @@ fn leases_that_new_rules_do_not_allow_end() {
     bench.send(Scope::Node, &lease("advertise", "cmd/vel"));
     bench.send(Scope::Layer, &lease("request", "cmd/vel"));
     bench.step(300);
-    assert_eq!(bench.bridges("cmd/vel"), ["node>Layer"]);
+    assert_eq!(bench.bridges("cmd/vel"), ["node>layer"]);
     let nobody = access(&json!([{"match": "cmd/*", "request": {"allow": []}}]));
     bench.core.set_access(bench.now, 0, nobody);
     bench.step(300);
@@ -390,5 +403,5 @@ fn leases_that_new_rules_do_not_allow_end() {
     assert_eq!(refused(&bench), 0, "it is allowed now and only has to ask");
     bench.send(Scope::Layer, &lease("request", "cmd/vel"));
     bench.step(300);
-    assert_eq!(bench.bridges("cmd/vel"), ["node>Layer"]);
+    assert_eq!(bench.bridges("cmd/vel"), ["node>layer"]);
 }

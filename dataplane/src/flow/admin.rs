@@ -15,7 +15,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use blaze_domain::control::{LeaseKind, rfc3339_millis};
-use blaze_domain::{Scope, TopicName};
+use blaze_domain::{Scope, ServiceName, TopicName};
 use serde_json::{Map, Value, json};
 
 use super::Shared;
@@ -24,8 +24,8 @@ use super::routes::SourceState;
 use crate::control::ControlCore;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
 use crate::lane::stats::Drops;
-use crate::plan::Target;
-use crate::registry::{LeaseView, Terms};
+use crate::plan::{Form, Target};
+use crate::registry::{FoundEndpoint, LeaseView, Terms};
 use crate::world::{Advertise, Request};
 
 type App = State<Arc<Shared>>;
@@ -85,6 +85,14 @@ async fn topics(State(shared): App) -> Json<Value> {
                 LeaseKind::Request => requested.push(row),
             }
         }
+        for (endpoint, owner) in registry.found(&topic) {
+            let row = found_row(&shared, endpoint);
+            match endpoint.kind {
+                LeaseKind::Advertise if owner == Some(&shared.me) => advertised.push(row),
+                LeaseKind::Advertise => {}
+                LeaseKind::Request => requested.push(row),
+            }
+        }
         for remote in registry.remote_leases(&topic) {
             advertised.extend(
                 remote
@@ -136,9 +144,9 @@ fn lease_row(shared: &Shared, now: Instant, lease: &LeaseView<'_>) -> Value {
         Terms::Advertise { rate_hz, max_bytes, .. } => {
             json!({"rate_hz": rate_hz, "max_bytes": max_bytes})
         }
-        Terms::Request { max_rate_hz, bare, from, .. } => json!({
+        Terms::Request { max_rate_hz, bare, json, from, .. } => json!({
             "max_rate_hz": max_rate_hz, "lifespan_ms": quality.lifespan_ms, "bare": bare,
-            "from": (!from.is_any())
+            "json": json, "from": (!from.is_any())
                 .then(|| json!({"layer": from.layer, "node": from.node, "service": from.service})),
         }),
     };
@@ -148,11 +156,26 @@ fn lease_row(shared: &Shared, now: Instant, lease: &LeaseView<'_>) -> Value {
         json!({
             "priority": quality.priority, "reliability": quality.reliability,
             "durability": quality.durability,
+            "type": quality.type_name, "type_hash": quality.type_hash,
+            "encoding": quality.encoding,
             "expires_in_s": lease.expires_in(now).map(|left| rounded(left.as_secs_f64())),
             "local": true,
         }),
     );
     row
+}
+
+/// A writer or reader of the ROS 2 network.
+fn found_row(shared: &Shared, endpoint: &FoundEndpoint) -> Value {
+    json!({
+        "layer": shared.me.layer, "node": shared.me.node,
+        "service": ServiceName::of_ros2_node(&endpoint.node), "instance": "0",
+        "scope": Scope::Ros2, "broker": "ros2", "ros_node": endpoint.node,
+        "guid": endpoint.guid.to_string(), "lifespan_ms": endpoint.lifespan_ms,
+        "reliability": endpoint.reliability, "durability": endpoint.durability,
+        "type": endpoint.type_name, "type_hash": endpoint.type_hash,
+        "encoding": "application/cdr", "expires_in_s": null, "local": true,
+    })
 }
 
 fn extend(row: &mut Value, more: Value) {
@@ -173,7 +196,8 @@ fn remote_advertise(
             "instance": "", "scope": scope,
             "broker": null, "rate_hz": advertise.rate_hz, "max_bytes": advertise.max_bytes,
             "priority": advertise.priority, "reliability": advertise.reliability,
-            "durability": advertise.durability,
+            "durability": advertise.durability, "type": advertise.type_name,
+            "type_hash": advertise.type_hash, "encoding": advertise.encoding,
             "expires_in_s": null, "local": false, "flow": flow,
         })
     };
@@ -192,8 +216,9 @@ fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) 
         "node": if scope == Scope::Node { flow.node.as_str() } else { "" }, "service": "",
         "instance": "", "scope": scope, "broker": null, "max_rate_hz": request.max_rate_hz,
         "lifespan_ms": request.lifespan_ms, "bare": request.bare, "priority": request.priority,
-        "reliability": request.reliability, "durability": request.durability, "expires_in_s": null,
-        "local": false,
+        "reliability": request.reliability, "durability": request.durability,
+        "json": request.json, "type": request.type_name, "type_hash": request.type_hash,
+        "encoding": null, "expires_in_s": null, "local": false,
         "flow": flow,
         "services": request.services.iter().map(|service| json!({
             "node": service.node, "service": service.service,
@@ -288,9 +313,14 @@ fn bridge_id(path: &TopicPath, bridge: &BridgeState, own_layer: &str) -> String 
     let topic = &path.name;
     let from = bridge.from;
     match &bridge.target {
-        Target::Node { bare: false } => format!("{topic}|{from}>node|{own_layer}"),
-        Target::Node { bare: true } => format!("{topic}|{from}>node|{own_layer}|bare"),
-        Target::Layer => format!("{topic}|{from}>layer|{own_layer}"),
+        target @ (Target::Node(_) | Target::Layer { .. } | Target::Ros2) => {
+            let form = match target {
+                Target::Node(Form::Bare) => "|bare",
+                target if target.is_json() => "|json",
+                _ => "",
+            };
+            format!("{topic}|{from}>{}|{own_layer}{form}", target.scope())
+        }
         Target::Inter { layer, receiver } => {
             let same_layer = |other: &&BridgeState| {
                 other.from == from
@@ -310,14 +340,13 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
         Phase::Failed { since } => ("failed", now.saturating_duration_since(since).as_secs_f64()),
         Phase::Draining { .. } | Phase::Ended => ("draining", 0.0),
     };
-    let (to_scope, layer, flow) = match &bridge.target {
-        Target::Node { .. } => (Scope::Node, shared.me.layer.to_string(), shared.me.to_string()),
-        Target::Layer => (Scope::Layer, shared.me.layer.to_string(), shared.me.to_string()),
-        Target::Inter { layer, receiver } => {
-            (Scope::Inter, layer.to_string(), receiver.to_string())
+    let (layer, flow) = match &bridge.target {
+        Target::Node(_) | Target::Layer { .. } | Target::Ros2 => {
+            (shared.me.layer.to_string(), shared.me.to_string())
         }
+        Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string()),
     };
-    let mut to = scope_and_broker(shared, to_scope);
+    let mut to = scope_and_broker(shared, bridge.target.scope());
     extend(&mut to, json!({"layer": layer, "flow": flow}));
     let dropped = dropped(&bridge.stats.dropped);
     let class = match bridge.sink {

@@ -237,6 +237,9 @@ impl ControlTask {
             Output::LayerAway(away) => {
                 plane.link(|engine| engine.set_layer_away(now, away));
             }
+            Output::Ros2(network) => {
+                plane.link(|engine| engine.set_ros2(now, network));
+            }
             Output::LayerScope { shared } => {
                 let said = if shared { self.shared.layer_scope } else { (LayerScope::None, 0) };
                 plane.link(|engine| engine.set_layer_scope(now, said.0, said.1));
@@ -284,7 +287,7 @@ impl ControlTask {
 
     /// What the own brokers keep of a writer goes.
     fn forget_writer(&self, topic: &TopicName, writer: WriterId) {
-        for side in [Scope::Node, Scope::Layer].into_iter().filter_map(|scope| self.side(scope)) {
+        for side in Scope::LOCAL.into_iter().filter_map(|scope| self.side(scope)) {
             side.forget_writer(&topic.into(), writer);
         }
     }

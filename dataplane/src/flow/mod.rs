@@ -450,7 +450,7 @@ fn start_inter(shared: &Arc<Shared>, supervisor: &Supervisor) -> anyhow::Result<
 
 /// Starts what follows the local brokers.
 fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, epoch: u64) {
-    for scope in [Scope::Node, Scope::Layer] {
+    for scope in Scope::LOCAL {
         let Some(broker) = shared.brokers.of(scope) else {
             continue;
         };

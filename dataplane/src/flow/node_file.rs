@@ -25,6 +25,7 @@ pub const KEYS: Keys = Keys {
         "brokers.node",
         "brokers.layer",
         "brokers.inter",
+        "brokers.plugins",
         "admin.flow",
         "cache",
         "flow",
@@ -37,6 +38,11 @@ pub const KEYS: Keys = Keys {
         "flow.compression",
         "flow.pool_threads",
         "flow.access",
+        "brokers.plugins[0].ros2.allow",
+        "brokers.plugins[0].ros2.deny",
+        "brokers.plugins[0].ros2.system",
+        "brokers.plugins[0].ros2.announce",
+        "brokers.plugins[0].ros2.interfaces",
         "log.level",
     ],
 };
@@ -56,10 +62,12 @@ fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
     same.flow.topics.clone_from(&file.flow.topics);
     same.flow.access.clone_from(&file.flow.access);
     same.log.level.clone_from(&file.log.level);
+    if let (Some(same), Some(file)) = (&mut same.brokers.ros2, &file.brokers.ros2) {
+        same.live.clone_from(&file.live);
+    }
     // What other programs read.
     same.admin.worker = file.admin.worker;
     same.admin.monitor = file.admin.monitor;
-    same.brokers.plugins.clone_from(&file.brokers.plugins);
     same.config.clone_from(&file.config);
     same.database.clone_from(&file.database);
     same.monitor.clone_from(&file.monitor);
@@ -189,6 +197,33 @@ mod tests {
         ] {
             assert!(needs_restart(&started, &file(other.clone())), "{other}");
         }
+    }
+
+    #[test]
+    fn of_a_ros2_network_what_is_bridged_changes_while_it_runs() {
+        let on = |ros2: Value| {
+            file(json!({"brokers": {"layer": {"memory": {}}, "plugins": [{"ros2": ros2}]}}))
+        };
+        let started = on(json!({}));
+        for live in [
+            json!({"allow": ["scan"]}),
+            json!({"deny": ["scan"]}),
+            json!({"system": true}),
+            json!({"announce": false}),
+            json!({"interfaces": ["/opt/ros/jazzy/share"]}),
+        ] {
+            assert!(!needs_restart(&started, &on(live.clone())), "{live}");
+        }
+        for other in [
+            json!({"domain": 1}),
+            json!({"interface": "10.0.1.1"}),
+            json!({"peers": ["10.0.1.2"]}),
+            json!({"distro": "humble"}),
+            json!({"namespace": "arm"}),
+        ] {
+            assert!(needs_restart(&started, &on(other.clone())), "{other}");
+        }
+        assert!(needs_restart(&started, &file(json!({}))));
     }
 
     #[test]

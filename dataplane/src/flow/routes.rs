@@ -15,7 +15,7 @@ use super::plane::Plane;
 use crate::control::Duty;
 use crate::lane::path::{TopicId, TopicInfo};
 use crate::lane::writer::NewWriter;
-use crate::plan::{Bridge, Target, TopicPlan};
+use crate::plan::{Bridge, Form, Target, TopicPlan};
 
 /// Messages that a source task takes at once.
 const BATCH: usize = 64;
@@ -38,7 +38,7 @@ impl LocalBrokers {
         match scope {
             Scope::Node => self.node.as_ref(),
             Scope::Layer => self.layer.as_ref(),
-            Scope::Inter => None,
+            Scope::Ros2 | Scope::Inter => None,
         }
     }
 
@@ -46,7 +46,7 @@ impl LocalBrokers {
     pub(super) fn lease_stores(&self) -> BTreeSet<Scope> {
         let keeps =
             |scope: &Scope| self.of(*scope).is_some_and(|broker| broker.flow_side().is_some());
-        [Scope::Node, Scope::Layer].into_iter().filter(keeps).collect()
+        Scope::LOCAL.into_iter().filter(keeps).collect()
     }
 }
 
@@ -135,7 +135,7 @@ impl Routes {
             let stopped_at = state.core.stopped_at(id);
             let path = state.core.path(id);
             let reads = |scope| (scope, path.reads(scope), path.reads_kept(scope));
-            Some((id, [Scope::Node, Scope::Layer].map(reads), stopped_at))
+            Some((id, Scope::LOCAL.map(reads), stopped_at))
         });
         let Some((id, reads, stopped_at)) = applied else {
             tracing::error!(%topic, "too many topics: this one is not carried");
@@ -184,10 +184,10 @@ impl Routes {
         large: bool,
         held: Option<NewWriter>,
     ) -> Result<NewWriter, String> {
-        let (scope, channel) = match bridge.to {
-            Target::Node { bare: true } => (Scope::Node, ChannelName::bare(topic)),
-            Target::Node { bare: false } => (Scope::Node, topic.into()),
-            Target::Layer | Target::Inter { .. } => (Scope::Layer, topic.into()),
+        let channel = match &bridge.to {
+            Target::Node(Form::Bare) => ChannelName::bare(topic),
+            target if target.is_json() => ChannelName::json(topic),
+            _ => topic.into(),
         };
         let lane = &bridge.lane;
         let options = PublisherOptions {
@@ -201,7 +201,7 @@ impl Routes {
         if let Some(held) = held.filter(keeps) {
             return Ok(held);
         }
-        let broker = self.brokers.of(scope).ok_or("the scope has no broker")?;
+        let broker = self.brokers.of(bridge.to.scope()).ok_or("the scope has no broker")?;
         let publisher = broker
             .publisher(&channel, options)
             .map_err(|error| format!("{topic} cannot be written: {error}"))?;
@@ -291,7 +291,7 @@ impl SourceTask {
         }
         let mut begin = match self.scope {
             Scope::Layer => self.plane.read(|state| state.core.begin_reading(self.topic, again)),
-            Scope::Node | Scope::Inter => Begin::Now,
+            Scope::Node | Scope::Ros2 | Scope::Inter => Begin::Now,
         };
         let mut reported = false;
         loop {

@@ -127,15 +127,17 @@ impl DataCore {
             return Err(DropReason::DecodeError.into());
         }
         let born_here = frame.hops() == 0;
-        if from == Scope::Node && !born_here {
-            // Only this flow writes to its node scope, and what it writes carries hops.
+        let of_flow = matches!(from, Scope::Node | Scope::Ros2);
+        if of_flow && !born_here {
+            // Only this flow writes to its node scope, and what it writes carries hops. Writers of
+            // flows on the ROS 2 network are not read.
             return Err(DropReason::Echo.into());
         }
         let me = &self.config.me;
         let own_layer = frame.origin_layer() == me.layer.as_str();
         let own_node = frame.origin_node() == me.node.as_str();
         let foreign = match from {
-            Scope::Node => !(own_layer && own_node),
+            Scope::Node | Scope::Ros2 => !(own_layer && own_node),
             Scope::Layer | Scope::Inter => born_here && !own_layer,
         };
         // Before the window takes the number: a foreign message must not silence the writer whose

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use blaze_brokers::PublishOutcome;
-use blaze_domain::{DropReason, Priority, Scope};
+use blaze_domain::{DropReason, FlowId, Priority, Scope};
 
 use super::admit::Admitted;
 use super::allocation::LaneGates;
@@ -134,16 +134,8 @@ impl BridgeState {
     }
 
     /// Whether the message is meant for this bridge at all; what is not is not counted as taken.
-    pub(super) fn wants(&self, message: &Admitted) -> bool {
-        if message.kept && !self.lane.durable {
-            return false;
-        }
-        // What a flow wrote stays in the layer: only what was born here leaves for another one, and
-        // what a flow that is not on the inter scope wrote from its node.
-        if matches!(self.target, Target::Inter { .. })
-            && !message.born_here
-            && !self.relays(message)
-        {
+    pub(super) fn wants(&self, me: &FlowId, message: &Admitted) -> bool {
+        if message.kept && !self.lane.durable || !self.is_way_of(me, message) {
             return false;
         }
         if self.lane.from.is_empty() {
@@ -151,6 +143,29 @@ impl BridgeState {
         }
         let frame = &message.frame;
         self.lane.carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+    }
+
+    /// Whether the message goes where the bridge writes on no other way.
+    fn is_way_of(&self, me: &FlowId, message: &Admitted) -> bool {
+        let frame = &message.frame;
+        match &self.target {
+            // What a flow wrote stays in the layer: only what was born here leaves for another one,
+            // and what a flow that is not on the inter scope wrote from its node.
+            Target::Inter { layer, .. } => {
+                let is_for = frame.to().is_empty()
+                    || frame.to().split_once('/').is_some_and(|(to, _)| to == layer.as_str());
+                is_for && (message.born_here || self.relays(message))
+            }
+            // What was born on a flow of the network that flow writes there.
+            Target::Ros2 => {
+                let is_for = frame.to().is_empty() || me.is_written(frame.to());
+                let (layer, node) = (frame.origin_layer(), frame.origin_node());
+                is_for && !self.lane.natives.write(self.from, message.hops, layer, node)
+            }
+            // The flow that wrote it to the layer made the copy.
+            Target::Layer { json: true } => self.from != Scope::Layer || message.born_here,
+            Target::Layer { json: false } | Target::Node(_) => true,
+        }
     }
 
     fn relays(&self, message: &Admitted) -> bool {
@@ -203,6 +218,11 @@ impl BridgeState {
             return None;
         }
         match &mut self.sink {
+            // Nothing here makes JSON of another encoding.
+            Sink::Publish { .. } if self.target.is_json() && !is_json(frame.encoding()) => {
+                self.stats.dropped.add(DropReason::ConvertError, 1);
+                None
+            }
             Sink::Publish { writer, bare, .. } => {
                 let Some(writer) = writer else {
                     self.stats.dropped.add(DropReason::BrokerError, 1);
@@ -330,4 +350,10 @@ impl BridgeState {
         let within_slack = (self.allocated_hz.unwrap_or(0.0) * SLACK.as_secs_f64()) as usize;
         within_slack.max(self.lane.depth as usize).max(1)
     }
+}
+
+/// Whether a media type is JSON.
+fn is_json(encoding: &str) -> bool {
+    let essence = encoding.split(';').next().unwrap_or_default().trim();
+    essence.eq_ignore_ascii_case("application/json")
 }

@@ -270,7 +270,7 @@ impl DataCore {
             let kept = received.kept;
             let meant = match from {
                 Scope::Layer if !kept => self.path_mut(topic).places.take(received.place),
-                Scope::Layer | Scope::Node | Scope::Inter => For::All,
+                Scope::Layer | Scope::Node | Scope::Ros2 | Scope::Inter => For::All,
             };
             match self.check_local(now, wall_ns, topic, from, received, meant) {
                 Ok(admitted) => self.fan_out(now, topic, from, &admitted, link),
@@ -435,6 +435,7 @@ impl DataCore {
         link: &mut dyn LaneLink,
     ) {
         self.kept.keep(now, topic, from, message);
+        let me = &self.config.me;
         let path = &mut self.topics[topic.0 as usize];
         let large = path.is_large(self.config.large_bytes);
         let mut lanes = ToLanes::new();
@@ -442,7 +443,7 @@ impl DataCore {
         for (at, bridge) in
             path.bridges.iter_mut().enumerate().filter(|(_, bridge)| bridge.from == from)
         {
-            if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
+            if bridge.takes() && bridge.wants(me, message) && bridge.is_meant(message.meant) {
                 offered |= bridge.lane_id().is_some();
                 let waiting = bridge.pass(now, message, large, &mut path.gates);
                 lanes.extend(waiting.map(|waiting| (at, waiting)));

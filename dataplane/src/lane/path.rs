@@ -75,7 +75,8 @@ impl TopicInfo {
     pub fn bare(&self, from: Scope) -> &BareInfo {
         match from {
             Scope::Node => &self.node,
-            Scope::Layer | Scope::Inter => &self.layer,
+            // There is nothing without a header on ROS 2.
+            Scope::Layer | Scope::Ros2 | Scope::Inter => &self.layer,
         }
     }
 }
@@ -197,13 +198,12 @@ pub struct BridgeState {
 }
 
 impl BridgeState {
-    /// `inter/<layer>`, `layer` or `node`: the label `to` of metrics.
+    /// `inter/<layer>`, `layer`, `node` or `ros2`: the label `to` of metrics.
     #[must_use]
     pub fn to_label(&self) -> String {
         match &self.target {
-            Target::Node { .. } => "node".to_owned(),
-            Target::Layer => "layer".to_owned(),
             Target::Inter { layer, .. } => format!("inter/{layer}"),
+            local => local.scope().to_string(),
         }
     }
 
@@ -249,7 +249,7 @@ impl BridgeState {
     pub fn receiver(&self) -> Option<(&LayerName, &FlowId)> {
         match &self.target {
             Target::Inter { layer, receiver } => Some((layer, receiver)),
-            Target::Node { .. } | Target::Layer => None,
+            Target::Node(_) | Target::Layer { .. } | Target::Ros2 => None,
         }
     }
 }

@@ -141,6 +141,7 @@ impl DataCore {
             let Some(bridge) = path.bridges.get_mut(at) else {
                 continue;
             };
+            let me = &self.config.me;
             // What of a writer waits for this bridge already, held or with the codec, is on its
             // way; what is kept besides is older, and goes before it.
             let passed_on = bridge.held.as_mut().map(std::mem::take);
@@ -157,7 +158,7 @@ impl DataCore {
                     continue;
                 }
                 // The rules may have changed since it came.
-                if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(&message) {
+                if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(me, &message) {
                     let waiting = bridge.pass(now, &message, large, &mut path.gates);
                     passed.extend(
                         waiting.map(|waiting| (message.frame, ToLanes::from_iter([(at, waiting)]))),
@@ -224,7 +225,7 @@ impl DataCore {
             }
             target => {
                 self.free_lanes.extend(old_lane);
-                Sink::Publish { writer: None, past: Vec::new(), bare: is_bare(target) }
+                Sink::Publish { writer: None, past: Vec::new(), bare: target.is_headless() }
             }
         };
         let bridge = BridgeState::new(now, planned, sink);
@@ -238,8 +239,4 @@ impl DataCore {
 
 pub(super) fn topic_id(index: usize) -> TopicId {
     TopicId(u32::try_from(index).unwrap_or(u32::MAX))
-}
-
-fn is_bare(target: &Target) -> bool {
-    matches!(target, Target::Node { bare: true })
 }

@@ -18,7 +18,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::thread::JoinHandle;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{DdsError, GuidPrefix, Profile, Relay, RelayConfig, Writer};
 use blaze_domain::node_file::Chunking;
@@ -127,6 +127,9 @@ pub struct DdsTransport {
     thread: Option<JoinHandle<()>>,
 }
 
+/// Time between two announcements to a host without a live flow.
+const ANNOUNCE: Duration = Duration::from_millis(500);
+
 impl DdsTransport {
     /// Starts it. A missing interface or taken ports are no error: it tries again each second, and
     /// [`DdsTransport::status`] says so.
@@ -140,6 +143,9 @@ impl DdsTransport {
             address,
             peers: config.peers.clone(),
             slots: config.peer_slots,
+            own_slots: 0,
+            holds_multicast: true,
+            repeat: ANNOUNCE,
         })?;
         let shared = Arc::new(Shared {
             wire: Wire::new(config.mtu, config.chunking, address.is_loopback()),

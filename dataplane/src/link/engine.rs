@@ -31,6 +31,7 @@ use super::peer::{HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
 use super::sender::SendClass;
 use super::transport::Endpoint;
 use super::wire::{HEADER_BYTES, RECORD_BYTES, SenderId};
+use crate::world::Ros2Network;
 
 /// Smallest datagram size that an engine uses, in bytes.
 pub const MIN_DATAGRAM_BYTES: usize = 1024;
@@ -93,6 +94,8 @@ pub struct Engine {
     pub(super) sender: SenderId,
     pub(super) state: State,
     pub(super) layer_away: bool,
+    /// The ROS 2 network that this flow is on.
+    pub(super) ros2: Option<Ros2Network>,
     pub(super) registry: (u64, u64),
     pub(super) addresses: Addresses,
     pub(super) egress: Option<Egress>,
@@ -129,6 +132,7 @@ impl Engine {
             sender: SenderId::of(&config.me, config.epoch),
             state: State::Starting,
             layer_away: false,
+            ros2: None,
             registry: (0, 0),
             addresses: Addresses::default(),
             egress: None,
@@ -185,6 +189,14 @@ impl Engine {
     pub fn set_layer_away(&mut self, now: Instant, away: bool) {
         if self.layer_away != away {
             self.layer_away = away;
+            self.hello_soon(now);
+        }
+    }
+
+    /// The ROS 2 network that this flow is on, for the next Hellos.
+    pub fn set_ros2(&mut self, now: Instant, network: Option<Ros2Network>) {
+        if self.ros2 != network {
+            self.ros2 = network;
             self.hello_soon(now);
         }
     }

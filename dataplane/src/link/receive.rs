@@ -211,7 +211,8 @@ impl Engine {
                     self.ledger.events.push_back(LinkEvent::Control { from, body });
                 }
             }
-            Body::Hello(_) => {}
+            // Nobody here asks for definitions yet.
+            Body::Hello(_) | Body::TypeRequest(_) | Body::TypeDefinition(_) => {}
         }
     }
 

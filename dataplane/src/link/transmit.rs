@@ -116,6 +116,8 @@ impl Engine {
             answers_written: true,
             layer_away: self.layer_away,
             takes_lz4: true,
+            ros2_network: self.ros2.map_or(0, |network| network.id.0),
+            ros2_address: self.ros2.map(|network| network.address.to_string()).unwrap_or_default(),
             // Who is on the inter scope is a gateway, if its group has any.
             ..Hello::default()
         }

@@ -12,6 +12,9 @@
 //! one receiver, which writes its node scope for its own requesters and its layer scope for
 //! everybody else's. What crossed the inter scope never leaves a layer again.
 //!
+//! A ROS 2 network is one more local scope; [`network`] says which of its flows reads and writes
+//! what.
+//!
 //! In a large group only some flows are on the inter scope, its [gateways](gateway). The others
 //! publish to the layer scope what flows of other groups ask for, and read there what those
 //! publish: to them, other groups are what a gateway says of them.
@@ -19,6 +22,7 @@
 pub(crate) mod balance;
 pub mod gateway;
 mod lane;
+pub mod network;
 pub(crate) mod rendezvous;
 mod rules;
 mod survey;
@@ -39,8 +43,9 @@ pub(crate) use view::{
     Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail,
 };
 
-use crate::world::{FlowState, LayerScopeId, OriginFilter, World};
+use crate::world::{FlowState, LayerScopeId, OriginFilter, Request, World};
 use lane::LaneBuilder;
+use network::{Natives, holds};
 
 /// What one flow does for one topic.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -78,7 +83,7 @@ impl TopicPlan {
         if !gone.is_empty() {
             self.blocked.push(blocked(Destination::Layer(me.layer.clone())));
         }
-        if gone.iter().any(|bridge| matches!(bridge.to, Target::Node { .. })) {
+        if gone.iter().any(|bridge| bridge.to.scope() == Scope::Node) {
             self.blocked.push(blocked(Destination::Flow(me.clone())));
         }
         self.blocked.sort();
@@ -96,7 +101,7 @@ impl Bridge {
     /// Whether it reads or writes the layer scope.
     #[must_use]
     pub fn uses_layer(&self) -> bool {
-        self.from == Scope::Layer || self.to == Target::Layer
+        self.from == Scope::Layer || self.to.scope() == Scope::Layer
     }
 }
 
@@ -111,16 +116,44 @@ pub struct Bridge {
     pub lane: LaneSpec,
 }
 
+/// How a message is written to a node scope.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Form {
+    /// With its header.
+    Framed,
+    /// Its payload alone, on a channel of its own.
+    Bare,
+    /// Its payload as JSON, on a channel of its own.
+    Json,
+}
+
+impl Form {
+    /// All of them, in the order of their bridges.
+    pub const ALL: [Self; 3] = [Self::Framed, Self::Bare, Self::Json];
+
+    /// Whether a request of a node scope is for this form.
+    #[must_use]
+    pub fn is_asked(self, request: &Request) -> bool {
+        match self {
+            Self::Framed => request.framed,
+            Self::Bare => request.bare,
+            Self::Json => request.json,
+        }
+    }
+}
+
 /// Where a bridge writes.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Target {
     /// Node scope of the flow.
-    Node {
-        /// Payloads without a header, on a channel of their own.
-        bare: bool,
-    },
+    Node(Form),
     /// Layer scope of the flow.
-    Layer,
+    Layer {
+        /// Payloads as JSON, on a channel of their own.
+        json: bool,
+    },
+    /// ROS 2 network of the flow.
+    Ros2,
     /// Another flow over the inter scope.
     Inter {
         /// Layer of the receiver.
@@ -136,8 +169,31 @@ impl Target {
     pub fn receiver(&self) -> Option<&FlowId> {
         match self {
             Self::Inter { receiver, .. } => Some(receiver),
-            Self::Node { .. } | Self::Layer => None,
+            Self::Node(_) | Self::Layer { .. } | Self::Ros2 => None,
         }
+    }
+
+    /// The scope that it is on.
+    #[must_use]
+    pub fn scope(&self) -> Scope {
+        match self {
+            Self::Node(_) => Scope::Node,
+            Self::Layer { .. } => Scope::Layer,
+            Self::Ros2 => Scope::Ros2,
+            Self::Inter { .. } => Scope::Inter,
+        }
+    }
+
+    /// Whether payloads go there as JSON.
+    #[must_use]
+    pub fn is_json(&self) -> bool {
+        matches!(self, Self::Node(Form::Json) | Self::Layer { json: true })
+    }
+
+    /// Whether payloads go there without a header.
+    #[must_use]
+    pub fn is_headless(&self) -> bool {
+        self.is_json() || *self == Self::Node(Form::Bare)
     }
 }
 
@@ -165,6 +221,8 @@ pub struct LaneSpec {
     /// To another group: the layer broker that its flows share, so that another of them could be
     /// the receiver as well; `None`: it is alone.
     pub shared: Option<LayerScopeId>,
+    /// To ROS 2, of what other flows wrote or sent: the flows on the network.
+    pub natives: Natives,
     /// What it takes is held for the moment: another flow carries the same, and what is on its way
     /// there is not to be overtaken.
     pub held: bool,
@@ -180,8 +238,7 @@ impl LaneSpec {
     /// Whether what the flow of that node wrote to the layer scope is carried out of it.
     #[must_use]
     pub fn relays(&self, layer: &str, node: &str) -> bool {
-        let order = |flow: &FlowId| (flow.layer.as_str(), flow.node.as_str()).cmp(&(layer, node));
-        self.relays.binary_search_by(order).is_ok()
+        holds(&self.relays, layer, node)
     }
 }
 
@@ -205,16 +262,8 @@ pub struct Blocked {
     pub detail: String,
 }
 
-/// What a flow writes of a message that another flow addressed to it. `None` = not there.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Delivery {
-    /// Node scope, with header.
-    pub node_framed: Option<LaneSpec>,
-    /// Node scope, payload only.
-    pub node_bare: Option<LaneSpec>,
-    /// Layer scope.
-    pub layer: Option<LaneSpec>,
-}
+/// What a flow writes of a message that another flow addressed to it, by target.
+pub type Delivery = BTreeMap<Target, LaneSpec>;
 
 /// Plans what the flow `world.me` does for a topic.
 ///
@@ -251,6 +300,7 @@ pub fn plan_within(
     let mut plan = Planner { view: &view, lanes: &lanes, bridges: BTreeMap::new() };
     if world.own().is_some_and(|own| own.state == FlowState::Ready) {
         plan.read_node(previous);
+        plan.read_ros2(previous);
         plan.read_layer(previous);
         plan.read_inter();
     }
@@ -283,14 +333,38 @@ pub fn owner(world: &World, topic: &TopicName) -> Option<FlowId> {
 
 fn deliver(view: &TopicView<'_>, lanes: &LaneBuilder) -> Delivery {
     let outside: Vec<_> = view.publishers_outside().collect();
-    let node = view.own_node_requester();
-    let node_lane =
-        node.and_then(|own| lanes.lane(view.pairs(outside.iter().copied(), std::iter::once(own))));
-    Delivery {
-        node_framed: node_lane.clone().filter(|_| node.is_some_and(|own| own.request.framed)),
-        node_bare: node_lane.filter(|_| node.is_some_and(|own| own.request.bare)),
-        layer: lanes.lane(view.pairs(outside.iter().copied(), view.requesters_over_own_layer())),
+    let lane = |(target, requesters): (Target, Vec<&Requester<'_>>)| {
+        let lane = lanes.lane(view.pairs(outside.iter().copied(), requesters))?;
+        Some((target.clone(), of_others(view, &target, lane)))
+    };
+    local_targets(view).into_iter().filter_map(lane).collect()
+}
+
+/// Where this flow writes what comes from elsewhere, and for whom.
+fn local_targets<'a, 'w>(view: &'a TopicView<'w>) -> Vec<(Target, Vec<&'a Requester<'w>>)> {
+    let mut targets: Vec<_> = node_targets(view).map(|(to, own)| (to, vec![own])).collect();
+    targets.push((Target::Layer { json: false }, view.requesters_over_own_layer().collect()));
+    targets.push((Target::Layer { json: true }, view.own_layer_json().into_iter().collect()));
+    targets.push((Target::Ros2, view.written_network().into_iter().collect()));
+    targets
+}
+
+/// The own node scope, in each form that its services ask for.
+fn node_targets<'a, 'w>(
+    view: &'a TopicView<'w>,
+) -> impl Iterator<Item = (Target, &'a Requester<'w>)> {
+    view.own_node_requester().into_iter().flat_map(|own| {
+        let forms = Form::ALL.into_iter().filter(|form| form.is_asked(own.request));
+        forms.map(move |form| (Target::Node(form), own))
+    })
+}
+
+/// The lane of what other flows wrote or sent.
+fn of_others(view: &TopicView<'_>, to: &Target, mut lane: LaneSpec) -> LaneSpec {
+    if *to == Target::Ros2 {
+        lane.natives = view.natives();
     }
+    lane
 }
 
 /// Collects the bridges of one topic.
@@ -300,37 +374,80 @@ struct Planner<'a, 'w> {
     bridges: BTreeMap<(Scope, Target), LaneSpec>,
 }
 
-impl Planner<'_, '_> {
-    /// What services of the own node publish: a bare copy beside it, to the own layer, to every
-    /// other group.
+impl<'w> Planner<'_, 'w> {
+    /// What services of the own node publish: copies in other forms beside it, to the own ROS 2
+    /// network, to the own layer, to every other group.
     fn read_node(&mut self, previous: Option<&TopicPlan>) {
         let Some(publisher) = self.view.own_node_publisher() else {
             return;
         };
-        let bare = self.view.own_node_requester().filter(|own| own.request.bare);
-        let lane = self.lanes.lane(self.view.pairs([publisher], bare));
-        self.put(Scope::Node, Target::Node { bare: true }, lane);
+        for (to, own) in node_targets(self.view).filter(|(to, _)| to.is_headless()) {
+            let lane = self.lanes.lane(self.view.pairs([publisher], [own]));
+            self.put(Scope::Node, to, lane);
+        }
+        if let Some(own) = self.view.own_network().filter(|own| publisher.matches(own)) {
+            let lane = self.lanes.lane([(publisher, &own)].into_iter());
+            self.put(Scope::Node, Target::Ros2, lane);
+        }
+        self.read_own(publisher, previous);
+    }
+
+    /// What the writers publish that this flow owns: to the own node, to the own layer, to every
+    /// other group.
+    fn read_ros2(&mut self, previous: Option<&TopicPlan>) {
+        let Some(publisher) = self.view.own_ros2_publisher() else {
+            return;
+        };
+        for (to, own) in node_targets(self.view) {
+            let lane = self.lanes.lane(self.view.pairs([publisher], [own]));
+            self.put(Scope::Ros2, to, lane);
+        }
+        self.read_own(publisher, previous);
+    }
+
+    /// What is published on this flow alone: to the own layer, to every other group.
+    fn read_own(&mut self, publisher: &Publisher<'w>, previous: Option<&TopicPlan>) {
         let over_layer = self
             .view
             .requesters_over_own_layer()
             .chain(self.view.requesters_over_gateways())
             .chain(self.view.requesters_over_former_carrier());
         let lane = self.lanes.lane(self.view.pairs([publisher], over_layer));
-        self.put(Scope::Node, Target::Layer, lane);
+        self.put(publisher.scope, Target::Layer { json: false }, lane);
+        let lane = self.lanes.lane(self.view.pairs([publisher], self.view.own_layer_json()));
+        self.put(publisher.scope, Target::Layer { json: true }, lane);
         self.send_to_other_groups(publisher, &[], previous);
     }
 
-    /// What is on the own layer scope: to the own node, and what was born there, or on a node that
-    /// is not on the inter scope, to every other group.
+    /// What is on the own layer scope: to the own node and ROS 2 network, and what was born there,
+    /// or on a node that is not on the inter scope, to every other group.
     fn read_layer(&mut self, previous: Option<&TopicPlan>) {
-        if let Some(own) = self.view.own_node_requester() {
-            let sources = self.view.publishers_over_own_layer(own);
-            let lane = self.lanes.lane(self.view.pairs(sources, [own]));
-            self.put_node(Scope::Layer, own, lane);
+        for (to, own) in node_targets(self.view) {
+            self.put_layer(to, own);
         }
-        if self.view.owner() != Some(self.view.me) {
-            return;
+        if let Some(own) = self.view.written_network() {
+            self.put_layer(Target::Ros2, own);
         }
+        if let (Some(born), Some(own)) =
+            (self.view.own_layer_publisher(), self.view.own_layer_json())
+            && self.view.converter_in(self.view.group) == Some(self.view.me)
+        {
+            let lane = self.lanes.lane(self.view.pairs([born], [own]));
+            self.put(Scope::Layer, Target::Layer { json: true }, lane);
+        }
+        if self.view.owner() == Some(self.view.me) {
+            self.carry_out(previous);
+        }
+    }
+
+    fn put_layer(&mut self, to: Target, own: &Requester<'w>) {
+        let sources = self.view.publishers_over_own_layer(own);
+        let lane = self.lanes.lane(self.view.pairs(sources, [own]));
+        let lane = lane.map(|lane| of_others(self.view, &to, lane));
+        self.put(Scope::Layer, to, lane);
+    }
+
+    fn carry_out(&mut self, previous: Option<&TopicPlan>) {
         let relayed: Vec<_> = self.view.relayed_publishers().collect();
         let carried = self.view.own_layer_publisher().into_iter().chain(relayed.iter().copied());
         let Some(offer) = told::merge_offers(carried.map(|publisher| publisher.advertise)) else {
@@ -340,30 +457,29 @@ impl Planner<'_, '_> {
             flow: self.view.me,
             group: self.view.group,
             scope: Scope::Layer,
+            network: None,
             advertise: &offer,
         };
-        let relays: Vec<FlowId> = relayed.iter().map(|publisher| publisher.flow.clone()).collect();
+        let mut relays: Vec<FlowId> =
+            relayed.iter().map(|publisher| publisher.flow.clone()).collect();
+        // One may have services on its node and own writers, too.
+        relays.dedup();
         self.send_to_other_groups(&publisher, &relays, previous);
     }
 
     /// What other groups publish, where their senders choose this flow.
     fn read_inter(&mut self) {
-        let delivery = deliver(self.view, self.lanes);
+        let mut delivery = deliver(self.view, self.lanes);
         let mine: Vec<_> = self
             .view
             .publishers_outside()
             .filter(|publisher| self.view.may_receive(publisher))
             .collect();
-        let mine = || mine.iter().copied();
-        if let Some(own) = self.view.own_node_requester()
-            && self.view.pairs(mine(), [own]).next().is_some()
-        {
-            self.put(Scope::Inter, Target::Node { bare: false }, delivery.node_framed);
-            self.put(Scope::Inter, Target::Node { bare: true }, delivery.node_bare);
-        }
-        let over_layer = self.view.requesters_over_own_layer();
-        if self.view.pairs(mine(), over_layer).next().is_some() {
-            self.put(Scope::Inter, Target::Layer, delivery.layer);
+        for (to, requesters) in local_targets(self.view) {
+            if self.view.pairs(mine.iter().copied(), requesters).next().is_some() {
+                let lane = delivery.remove(&to);
+                self.put(Scope::Inter, to, lane);
+            }
         }
     }
 
@@ -386,7 +502,7 @@ impl Planner<'_, '_> {
                 .lane(self.view.pairs([publisher], requesters.iter().copied()))
                 .map(|lane| LaneSpec {
                     relays: relays.to_vec(),
-                    held: publisher.scope == Scope::Node && self.view.enters(),
+                    held: publisher.is_of_flow() && self.view.enters(),
                     shared: match group {
                         Group::Shared(_, broker) => Some(broker),
                         Group::Alone(_) => None,
@@ -399,15 +515,6 @@ impl Planner<'_, '_> {
             let target =
                 Target::Inter { layer: receiver.layer.clone(), receiver: receiver.clone() };
             self.put(publisher.scope, target, lane);
-        }
-    }
-
-    fn put_node(&mut self, from: Scope, own: &Requester<'_>, lane: Option<LaneSpec>) {
-        if own.request.framed {
-            self.put(from, Target::Node { bare: false }, lane.clone());
-        }
-        if own.request.bare {
-            self.put(from, Target::Node { bare: true }, lane);
         }
     }
 

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use blaze_domain::{FlowId, TopicName};
 
+use super::network::{self, Networks};
 use super::{Group, gateway};
 use crate::world::{FlowState, FlowView, Reach, Role, TopicEntry, World};
 
@@ -19,6 +20,7 @@ pub struct Survey<'w> {
     pub(super) gateways: Arc<[&'w FlowId]>,
     /// Flows of the own group that are not.
     pub(super) members: Arc<BTreeSet<&'w FlowId>>,
+    pub(super) networks: Arc<Networks<'w>>,
     by_topic: Option<HashMap<&'w TopicName, Vec<Holder<'w>>>>,
 }
 
@@ -39,6 +41,7 @@ impl<'w> Survey<'w> {
             world,
             gateways: gateway::gateways(world).collect(),
             members: Arc::new(gateway::members(world).collect()),
+            networks: Arc::new(network::networks(world)),
             by_topic: None,
         }
     }

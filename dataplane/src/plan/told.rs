@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 use blaze_domain::{FlowId, TopicName};
 
 use super::Group;
+use super::network::{self, Network};
 use super::survey::{Survey, carries};
 use crate::registry::requesters;
 use crate::world::{Advertise, FlowView, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
@@ -26,13 +27,21 @@ pub(crate) fn told_outside(survey: &Survey<'_>, topic: &TopicName) -> Option<Top
     if survey.speaks_for_others() {
         let mut own_layer = std::mem::take(&mut told.layer);
         let mut of_nodes = Vec::new();
-        for (_, view, entry) in survey.entries(topic, |id, view| survey.is_behind(id, view)) {
+        // Another flow may write to the network.
+        let mut of_networks = Vec::new();
+        for (id, view, entry) in survey.entries(topic, |id, view| survey.is_behind(id, view)) {
             // Every flow of the group has the same leases there, so one of them is enough.
             own_layer.advertise = own_layer.advertise.or_else(|| entry.layer.advertise.clone());
             own_layer.request = own_layer.request.or_else(|| entry.layer.request.clone());
             of_nodes.extend(view.node_scope.then_some(&entry.node));
+            of_networks.extend(Network::of(id, view).map(|network| {
+                let reads = network::writer(&survey.networks, network, topic) == Some(id);
+                let request = entry.ros2.request.clone().filter(|_| reads);
+                ScopeEntry { advertise: entry.ros2.advertise.clone(), request }
+            }));
         }
-        told.layer = merge(std::iter::once(&own_layer).chain(of_nodes));
+        let others = of_nodes.into_iter().chain(&of_networks);
+        told.layer = merge(std::iter::once(&own_layer).chain(others));
     }
     (!told.is_empty()).then_some(told)
 }
@@ -49,6 +58,7 @@ pub(crate) fn told_inside(survey: &Survey<'_>, topic: &TopicName) -> ScopeEntry 
     let is_outside = |id: &FlowId, view: &FlowView| carries(view) && Group::of(id, view) != here;
     for (id, view, entry) in survey.entries(topic, is_outside) {
         entries.extend(view.node_scope.then_some(&entry.node));
+        entries.extend(view.ros2.map(|_| &entry.ros2));
         // Flows that share a broker say the same of it.
         let says_something = entry.layer.advertise.is_some() || entry.layer.request.is_some();
         if view.layer_scope.is_some() && says_something && groups.insert(Group::of(id, view)) {
@@ -70,7 +80,7 @@ fn merge<'a>(entries: impl IntoIterator<Item = &'a ScopeEntry>) -> ScopeEntry {
 
 /// Advertisements of several scopes as one: sum of rates, largest size, strongest quality of
 /// service.
-pub(super) fn merge_offers<'a>(
+pub(crate) fn merge_offers<'a>(
     offers: impl IntoIterator<Item = &'a Advertise>,
 ) -> Option<Advertise> {
     let mut offers = offers.into_iter().peekable();
@@ -113,7 +123,9 @@ fn add_offer(merged: &mut Advertise, other: &Advertise) {
 
 /// Requests of several scopes as one: highest rate, strongest quality of service, every origin that
 /// one of them asks for.
-fn merge_requests<'a>(requests: impl IntoIterator<Item = &'a Request>) -> Option<Request> {
+pub(crate) fn merge_requests<'a>(
+    requests: impl IntoIterator<Item = &'a Request>,
+) -> Option<Request> {
     let mut requests = requests.into_iter().peekable();
     let first = requests.next()?;
     let mut merged = first.clone();
@@ -121,7 +133,7 @@ fn merge_requests<'a>(requests: impl IntoIterator<Item = &'a Request>) -> Option
         return Some(merged);
     }
     // How a scope behind a gateway is served is the affair of the flow that has it.
-    (merged.framed, merged.bare) = (true, false);
+    (merged.framed, merged.bare, merged.json) = (true, false, false);
     let mut filters: BTreeSet<&OriginFilter> = first.from.iter().collect();
     let mut any_origin = filters.is_empty();
     for other in requests {

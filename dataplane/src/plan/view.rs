@@ -1,6 +1,7 @@
 //! The world as one topic sees it: publishers, requesters, and who of them matches whom.
 
 mod access;
+mod network;
 mod successor;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -10,6 +11,7 @@ use std::sync::Arc;
 use blaze_domain::node_file::TopicAccess;
 use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 
+use super::network::{self as networks, Network, Networks};
 use super::survey::Holder;
 use super::{Blocked, Destination, Survey, rendezvous};
 use crate::world::{
@@ -38,6 +40,8 @@ pub(crate) struct Publisher<'w> {
     pub(crate) flow: &'w FlowId,
     pub(crate) group: Group<'w>,
     pub(crate) scope: Scope,
+    /// The ROS 2 network that the flow is on.
+    pub(crate) network: Option<Network<'w>>,
     pub(crate) advertise: &'w Advertise,
 }
 
@@ -47,6 +51,8 @@ pub(crate) struct Requester<'w> {
     pub(crate) flow: &'w FlowId,
     pub(crate) group: Group<'w>,
     pub(crate) scope: Scope,
+    /// The ROS 2 network that the flow is on.
+    pub(crate) network: Option<Network<'w>>,
     pub(crate) request: &'w Request,
 }
 
@@ -61,7 +67,7 @@ pub(crate) enum Pairing {
 impl Requester<'_> {
     pub(crate) fn destination(&self) -> Destination {
         match self.scope {
-            Scope::Node | Scope::Inter => Destination::Flow(self.flow.clone()),
+            Scope::Node | Scope::Ros2 | Scope::Inter => Destination::Flow(self.flow.clone()),
             Scope::Layer => Destination::Layer(self.flow.layer.clone()),
         }
     }
@@ -81,8 +87,27 @@ impl Publisher<'_> {
         }
     }
 
-    fn matches(&self, requester: &Requester<'_>) -> bool {
+    pub(super) fn matches(&self, requester: &Requester<'_>) -> bool {
         self.pairing(requester.request) == Pairing::Matches
+    }
+
+    /// Whether it is on one flow alone: on its node, or a writer that it owns.
+    pub(crate) fn is_of_flow(&self) -> bool {
+        matches!(self.scope, Scope::Node | Scope::Ros2)
+    }
+
+    /// Whether the requester is a network that the flow of the publisher is on, too: what it does
+    /// not publish there itself, that flow writes.
+    pub(crate) fn shares_network(&self, requester: &Requester<'_>) -> bool {
+        requester.scope == Scope::Ros2
+            && self.is_of_flow()
+            && self.network.is_some()
+            && self.network == requester.network
+    }
+
+    /// Whether other flows than that of the publisher may have a part in serving the requester.
+    fn serves(&self, requester: &Requester<'_>) -> bool {
+        self.matches(requester) && !self.shares_network(requester)
     }
 
     fn has_origin(&self, filter: &OriginFilter) -> bool {
@@ -97,7 +122,7 @@ impl Publisher<'_> {
         if !part(&filter.layer, self.flow.layer.as_str()) {
             return false;
         }
-        let on_node = self.scope == Scope::Node;
+        let on_node = self.is_of_flow();
         if on_node && !part(&filter.node, self.flow.node.as_str()) {
             return false;
         }
@@ -138,6 +163,8 @@ pub(crate) struct TopicView<'w> {
     gateways: Arc<[&'w FlowId]>,
     /// Flows of the own group that are not.
     members: Arc<BTreeSet<&'w FlowId>>,
+    /// ROS 2 networks with their flows.
+    networks: Arc<Networks<'w>>,
     /// Flows that have to do with the topic.
     holders: Vec<Holder<'w>>,
 }
@@ -166,6 +193,7 @@ impl<'w> TopicView<'w> {
             role: own.role,
             gateways: Arc::clone(&survey.gateways),
             members: Arc::clone(&survey.members),
+            networks: Arc::clone(&survey.networks),
             holders: survey.find(topic),
         };
         for at in 0..view.holders.len() {
@@ -188,6 +216,8 @@ impl<'w> TopicView<'w> {
         }
         let node = view.node_scope.then_some((Scope::Node, &entry.node));
         let layer = view.layer_scope.map(|_| (Scope::Layer, &entry.layer));
+        let network = Network::of(flow, view);
+        let ros2 = network.map(|_| (Scope::Ros2, &entry.ros2));
         // A flow knows that it lives; what it is told of itself does not count.
         let reachable = view.reach != Reach::Down || flow == self.me;
         let carries = reachable && view.state == FlowState::Ready;
@@ -196,12 +226,17 @@ impl<'w> TopicView<'w> {
             && view.role.is_gateway()
             && !self.role.is_gateway();
         let outside = (behind && carries).then_some((Scope::Inter, &entry.outside));
-        for (scope, entry) in node.into_iter().chain(layer).chain(outside) {
+        // A call from a node is for the flow of its server, also of one on the own network.
+        let of_service = networks::is_of_service(self.topic);
+        for (scope, entry) in node.into_iter().chain(layer).chain(ros2).chain(outside) {
             if let Some(advertise) = entry.advertise.as_ref().filter(|_| carries) {
-                self.publishers.push(Publisher { flow, group, scope, advertise });
+                let network = network.filter(|_| scope != Scope::Node || !of_service);
+                self.publishers.push(Publisher { flow, group, scope, network, advertise });
             }
-            if let Some(request) = &entry.request {
-                let requester = Requester { flow, group, scope, request };
+            // All flows of a network say the same of its readers: only the one that writes counts.
+            let counts = scope != Scope::Ros2 || !carries || self.writes(flow, network);
+            if let Some(request) = entry.request.as_ref().filter(|_| counts) {
+                let requester = Requester { flow, group, scope, network, request };
                 if carries && self.may_request(&requester) {
                     self.requesters.push(requester);
                 } else if carries {
@@ -231,12 +266,29 @@ impl<'w> TopicView<'w> {
             .find(|requester| requester.flow == self.me && requester.scope == Scope::Node)
     }
 
+    /// The services of the own layer scope, if they want JSON.
+    pub(crate) fn own_layer_json(&self) -> Option<&Requester<'w>> {
+        self.requesters.iter().find(|requester| {
+            (requester.flow, requester.scope) == (self.me, Scope::Layer) && requester.request.json
+        })
+    }
+
+    /// The flow of a group that makes JSON of what services of the layer scope publish, for others
+    /// there.
+    pub(crate) fn converter_in(&self, group: Group<'w>) -> Option<&'w FlowId> {
+        let able = |(id, view): &(&'w FlowId, &'w FlowView)| {
+            self.world.carries(id) && Group::of(id, view) == group
+        };
+        let flows = self.world.flows.iter().filter(able);
+        rendezvous::choose(self.topic.as_str(), flows.map(|(id, _)| id))
+    }
+
     /// Everybody whom a message reaches that this flow writes to its layer scope: services there,
     /// other flows' services.
     pub(crate) fn requesters_over_own_layer(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
         let of_layer = |requester: &Requester<'_>| match requester.scope {
-            Scope::Layer => true,
-            Scope::Node => requester.flow != self.me,
+            Scope::Layer => requester.request.framed,
+            Scope::Node | Scope::Ros2 => requester.flow != self.me,
             Scope::Inter => false,
         };
         self.requesters
@@ -282,7 +334,7 @@ impl<'w> TopicView<'w> {
         // Of a thousand publishers hardly any is of the own group, so that is asked first.
         let relayed = |publisher: &&Publisher<'w>| {
             let view = || self.world.flows.get(publisher.flow);
-            publisher.scope == Scope::Node
+            publisher.is_of_flow()
                 && publisher.group == self.group
                 && !(publisher.flow == self.me && self.enters())
                 && view().is_some_and(|view| view.role != Role::Gateway)
@@ -303,7 +355,7 @@ impl<'w> TopicView<'w> {
             if publisher.group == self.group {
                 publisher.scope == Scope::Layer || publisher.flow != self.me
             } else {
-                publisher.matches(own)
+                publisher.serves(own)
                     && self.candidates(publisher, self.group).any(|flow| flow != self.me)
             }
         })
@@ -334,7 +386,7 @@ impl<'w> TopicView<'w> {
     {
         let requesters = requesters.into_iter();
         publishers.into_iter().flat_map(move |publisher| {
-            let matching = requesters.clone().filter(move |requester| publisher.matches(requester));
+            let matching = requesters.clone().filter(move |requester| publisher.serves(requester));
             matching.map(move |requester| (publisher, requester))
         })
     }
@@ -350,7 +402,7 @@ impl<'w> TopicView<'w> {
         let in_group = known.filter(move |requester| {
             requester.group == group
                 && requester.scope != Scope::Inter
-                && publisher.matches(requester)
+                && publisher.serves(requester)
         });
         let behind = |requester: &&Requester<'w>| self.members.contains(requester.flow);
         // For those that are not on the inter scope any gateway can: it writes to the layer scope
@@ -500,7 +552,7 @@ impl<'w> TopicView<'w> {
     pub(crate) fn blocked(&self) -> Vec<Blocked> {
         let mut blocked = BTreeSet::new();
         let carried = |publisher: &&Publisher<'w>| match publisher.scope {
-            Scope::Node | Scope::Inter => publisher.flow == self.me,
+            Scope::Node | Scope::Ros2 | Scope::Inter => publisher.flow == self.me,
             Scope::Layer => publisher.flow == self.me && self.owner() == Some(self.me),
         };
         let sent: Vec<_> = self.publishers.iter().filter(carried).collect();
@@ -531,9 +583,9 @@ impl<'w> TopicView<'w> {
             }
         }
         for requester in &self.lost_requesters {
-            let wanted = sent.iter().any(|publisher| {
-                publisher.group != requester.group && publisher.matches(requester)
-            });
+            let wanted = sent
+                .iter()
+                .any(|publisher| publisher.group != requester.group && publisher.serves(requester));
             // A layer scope has other flows to reach it by; if it has none, nobody says that it is
             // still there.
             if wanted && requester.scope == Scope::Node {
@@ -559,9 +611,12 @@ pub(crate) fn meets_directly(publisher: &Publisher<'_>, requester: &Requester<'_
     publisher.scope == requester.scope
         && match publisher.scope {
             Scope::Node | Scope::Inter => {
-                publisher.flow == requester.flow && !requester.request.bare
+                publisher.flow == requester.flow
+                    && !requester.request.bare
+                    && !requester.request.json
             }
-            Scope::Layer => publisher.group == requester.group,
+            Scope::Layer => publisher.group == requester.group && !requester.request.json,
+            Scope::Ros2 => publisher.shares_network(requester),
         }
 }
 

@@ -32,7 +32,9 @@ impl Registry {
             detail: self.denial(&lease.topic, &lease.key),
         });
         let events = events.collect();
-        let changed = self.refresh(now, denied.iter().map(|lease| lease.topic.clone()).collect());
+        let leased = denied.iter().map(|lease| &lease.topic);
+        let changed = leased.chain(self.found.topics()).cloned().collect();
+        let changed = self.refresh(now, changed);
         Changes { events, changed, lapsed: denied }
     }
 

@@ -351,4 +351,6 @@ fn only_routes(entry: &wire::Entry) -> bool {
         && entry.layer_request.is_none()
         && entry.outside_advertise.is_none()
         && entry.outside_request.is_none()
+        && entry.ros2_advertise.is_none()
+        && entry.ros2_request.is_none()
 }

@@ -28,23 +28,23 @@ pub(super) fn key_here(scope: Scope, me: &FlowId, kind: LeaseKind, common: &Comm
         layer: me.layer.clone(),
         node: match scope {
             Scope::Node => Some(me.node.clone()),
-            Scope::Layer | Scope::Inter => common.node.clone(),
+            Scope::Layer | Scope::Ros2 | Scope::Inter => common.node.clone(),
         },
         service: common.service.clone(),
         instance: common.instance.clone(),
     }
 }
 
-/// What a message asks for; a withdrawal asks for nothing.
+/// The lease that a message asks for; a withdrawal and a call ask for none.
 pub(super) fn kind_of(message: &ControlMessage) -> Option<LeaseKind> {
     match message {
         ControlMessage::Advertise(_) => Some(LeaseKind::Advertise),
         ControlMessage::Request(_) => Some(LeaseKind::Request),
-        ControlMessage::Withdraw(_) => None,
+        ControlMessage::Withdraw(_) | ControlMessage::Call(_) => None,
     }
 }
 
-/// The lease that a message grants or renews; a withdrawal has none.
+/// The lease that a message grants or renews; a withdrawal and a call have none.
 pub(super) fn lease_of<'m>(
     now: Instant,
     scope: Scope,
@@ -69,13 +69,13 @@ pub(super) fn lease_of<'m>(
             Terms::Request {
                 max_rate_hz: message.max_rate_hz,
                 bare: message.bare,
+                json: message.json,
                 from: message.from.clone(),
                 quality: message.quality.clone(),
             },
         ),
-        ControlMessage::Withdraw(_) => {
-            let error =
-                ControlError::new(ErrorCode::UnknownOp, pointer, "a withdrawal grants nothing");
+        ControlMessage::Withdraw(_) | ControlMessage::Call(_) => {
+            let error = ControlError::new(ErrorCode::UnknownOp, pointer, "it grants nothing");
             return Err(error);
         }
     };

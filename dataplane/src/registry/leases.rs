@@ -60,6 +60,8 @@ pub enum Terms {
         max_rate_hz: Option<f64>,
         /// Payloads without a header.
         bare: bool,
+        /// Payloads as JSON.
+        json: bool,
         /// Only messages of that origin.
         from: OriginSelector,
         /// Type and quality of service.
@@ -132,12 +134,13 @@ impl<'a> LeaseView<'a> {
                     quality,
                 })
             }
-            Terms::Request { max_rate_hz, bare, from, quality } => {
+            Terms::Request { max_rate_hz, bare, json, from, quality } => {
                 ControlMessage::Request(RequestMessage {
                     common,
                     ttl_s,
                     max_rate_hz,
                     bare,
+                    json,
                     from,
                     quality,
                 })

@@ -62,14 +62,14 @@ fn merge_advertise<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> O
 
 fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Option<Request> {
     let terms = leases.clone().filter_map(|lease| match lease.terms {
-        Terms::Request { max_rate_hz, bare, from, .. } => Some((*max_rate_hz, *bare, from)),
+        Terms::Request { max_rate_hz, from, .. } => Some((*max_rate_hz, from)),
         Terms::Advertise { .. } => None,
     });
     let quality = merge_quality(leases.clone().map(|lease| lease.quality()))?;
     let (services, more_services) = requesters(leases.clone().map(|lease| source(&lease)), 0);
     let mut filters = BTreeSet::new();
     let mut any_origin = false;
-    for (_, _, from) in terms.clone() {
+    for (_, from) in terms.clone() {
         any_origin |= from.is_any();
         if !any_origin {
             filters.insert(OriginFilter {
@@ -81,7 +81,7 @@ fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Opt
         }
     }
     Some(Request {
-        max_rate_hz: highest_rate(terms.clone().map(|(rate, _, _)| rate)),
+        max_rate_hz: highest_rate(terms.map(|(rate, _)| rate)),
         lifespan_ms: quality.lifespan_ms,
         reliability: quality.reliability,
         durability: quality.durability,
@@ -89,6 +89,7 @@ fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Opt
         // A request may only lower the class, so one that says nothing asks for the highest there
         // is: as published.
         priority: leases
+            .clone()
             .map(|lease| lease.quality().priority)
             .collect::<Option<Vec<Priority>>>()
             .and_then(|all| all.into_iter().min()),
@@ -97,9 +98,22 @@ fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Opt
         type_hash: quality.type_hash,
         services,
         more_services,
-        framed: terms.clone().any(|(_, bare, _)| !bare),
-        bare: terms.into_iter().any(|(_, bare, _)| bare),
+        framed: leases.clone().any(|lease| wants_header(&lease)),
+        bare: leases.clone().any(|lease| matches!(lease.terms, Terms::Request { bare: true, .. })),
+        json: leases
+            .into_iter()
+            .any(|lease| matches!(lease.terms, Terms::Request { json: true, .. })),
     })
+}
+
+/// Whether a request is served with messages that have a header. On a layer scope there are no
+/// bare copies: there it gets these instead.
+fn wants_header(lease: &LeaseView<'_>) -> bool {
+    match lease.terms {
+        Terms::Request { bare, json, .. } if lease.key.scope == Scope::Node => !bare && !json,
+        Terms::Request { bare, json, .. } => *bare || !json,
+        Terms::Advertise { .. } => false,
+    }
 }
 
 /// The first services of all, and how many more there are beside `others`, which are not named.

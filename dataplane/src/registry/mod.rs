@@ -12,6 +12,7 @@
 
 mod access;
 mod announce;
+mod found;
 mod gateways;
 mod holder;
 mod kept;
@@ -33,13 +34,16 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
 use blaze_domain::control::{
-    Answer, ControlError, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload,
+    Answer, ControlError, ControlMessage, ErrorCode, EventKind, LeaseKind, ParsedObject,
+    parse_payload,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Durability, FlowId, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, RouteState};
 
 use announce::{Announcer, MAX_LEASED_ENTRIES};
+use found::Found;
+pub use found::{FoundEndpoint, MAX_ENDPOINTS};
 use leases::LeaseTable;
 pub use leases::{LapseReason, LapsedLease, LeaseKey, LeaseView, Terms};
 pub use loads::{Load, REST};
@@ -112,6 +116,8 @@ pub struct Registry {
     on_layer: BTreeSet<TopicName>,
     /// Scopes that belong to another flow: for the world they are not there.
     off: BTreeSet<Scope>,
+    /// What the adapter of the ROS 2 network has found.
+    found: Found,
 }
 
 impl Registry {
@@ -131,6 +137,7 @@ impl Registry {
             names: NameBook::new(config.layer_names.clone()),
             on_layer: BTreeSet::new(),
             off: BTreeSet::new(),
+            found: Found::default(),
             routes: BTreeMap::new(),
             announcer: Announcer::default(),
             layer_announcer: Announcer::default(),
@@ -250,6 +257,11 @@ impl Registry {
     ) -> Result<u32, ControlError> {
         let message = object.message.as_ref().map_err(Clone::clone)?;
         let common = message.common();
+        if let ControlMessage::Call(_) = message {
+            let pointer = format!("{}/op", object.pointer);
+            let detail = "this flow is on no ROS 2 network: it cannot call services";
+            return Err(ControlError::new(ErrorCode::NoServer, pointer, detail));
+        }
         self.check_access(now, scope, message, &object.pointer)?;
         if scope == Scope::Layer
             && self.config.layer_answers_need_id
@@ -314,8 +326,10 @@ impl Registry {
         if !changes {
             return BTreeSet::new();
         }
-        let leased: BTreeSet<TopicName> = self.leases.topics().cloned().collect();
-        if in_use {
+        let leased: BTreeSet<TopicName> =
+            self.leases.topics().chain(self.found.topics()).cloned().collect();
+        // On a ROS 2 network there are no leases.
+        if in_use && scope != Scope::Ros2 {
             self.leases.give_up(scope);
         }
         let (node_scope, layer_scope) = (self.config.node_scope, self.config.layer_scope);
@@ -325,6 +339,7 @@ impl Registry {
             own.node_scope = node_scope && !node_off;
             own.layer_scope = layer_scope.filter(|_| !layer_off);
         }
+        self.show_ros2();
         let mut changed = self.all_topics();
         changed.extend(self.refresh(now, leased));
         changed
@@ -363,9 +378,16 @@ impl Registry {
         let mut changed = BTreeSet::new();
         for topic in dirty {
             let mut merged = merge::merge(&self.leases.of_topic(&topic));
-            for (scope, entry) in
-                [(Scope::Node, &mut merged.node), (Scope::Layer, &mut merged.layer)]
-            {
+            if self.found.network.is_some() {
+                let access = self.access_of(&topic);
+                merged.ros2 = self.found.merged(&self.config.me, &topic, &access);
+            }
+            let scopes = [
+                (Scope::Node, &mut merged.node),
+                (Scope::Layer, &mut merged.layer),
+                (Scope::Ros2, &mut merged.ros2),
+            ];
+            for (scope, entry) in scopes {
                 if self.off.contains(&scope) {
                     *entry = ScopeEntry::default();
                 }
@@ -419,6 +441,13 @@ impl Registry {
             _ => 0,
         };
         of_scope.map(depth).max()
+    }
+
+    /// Whether a service of that scope asks for the topic as JSON.
+    #[must_use]
+    pub fn wants_json(&self, topic: &TopicName, scope: Scope) -> bool {
+        let mut of_scope = self.leases.of_topic(topic).filter(|lease| lease.key.scope == scope);
+        of_scope.any(|lease| matches!(lease.terms, Terms::Request { json: true, .. }))
     }
 
     /// All leases, by topic.

@@ -12,7 +12,10 @@ use super::remote::Remote;
 use super::types::RemoteLease;
 use super::{Registry, Way};
 use crate::link::kind_from_wire;
-use crate::world::{FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Role};
+use crate::world::{
+    FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Role, Ros2Network, Ros2NetworkId,
+    TopicEntry,
+};
 
 /// Most other flows that are followed.
 pub const MAX_FLOWS: usize = 1280;
@@ -65,6 +68,7 @@ impl Registry {
             State::Starting | State::Unspecified => FlowState::Starting,
         };
         let layer_scope = (hello.layer_scope_id != 0).then_some(LayerScopeId(hello.layer_scope_id));
+        let ros2 = ros2_network(hello);
         let mut changed = BTreeSet::new();
         // Of a flow that shares the layer broker counts what it says there: on the inter scope it
         // speaks to others, and under lives of their own.
@@ -109,8 +113,10 @@ impl Registry {
         let state = if is_new { state } else { state.max(view.state) };
         let said = (kind, state, layer_scope, gateway, role, hello.layer_away);
         let (scope, away) = (view.layer_scope, view.layer_away);
-        let same = !is_new && (view.kind, view.state, scope, view.gateway, view.role, away) == said;
+        let same = (view.kind, view.state, scope, view.gateway, view.role, away) == said;
+        let same = !is_new && same && view.ros2 == ros2;
         (view.kind, view.state, view.layer_scope, view.gateway, view.role, view.layer_away) = said;
+        view.ros2 = ros2;
         let remote = self.remotes.entry(from.clone()).or_default();
         if way == Way::Layer {
             remote.link_peers = hello.link_peers;
@@ -192,7 +198,9 @@ impl Registry {
             | Body::Feedback(_)
             | Body::Goodbye(_)
             | Body::WrittenRequest(_)
-            | Body::Written(_) => {
+            | Body::Written(_)
+            | Body::TypeRequest(_)
+            | Body::TypeDefinition(_) => {
                 return BTreeSet::new();
             }
         };
@@ -360,12 +368,10 @@ impl Registry {
         };
         self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me).flat_map(
             move |(flow, view)| {
-                let entry = view.topics.get(topic);
-                let node = entry.map(|entry| (Scope::Node, &entry.node));
-                let layer =
-                    entry.filter(|_| !shares(flow, view)).map(|entry| (Scope::Layer, &entry.layer));
-                let outside = entry.map(|entry| (Scope::Inter, &entry.outside));
-                node.into_iter().chain(layer).chain(outside).filter_map(move |(scope, entry)| {
+                let scopes = view.topics.get(topic).map(TopicEntry::scopes);
+                let told = move |scope: Scope| scope != Scope::Layer || !shares(flow, view);
+                let scopes = scopes.into_iter().flatten().filter(move |(scope, _)| told(*scope));
+                scopes.filter_map(move |(scope, entry)| {
                     (entry.advertise.is_some() || entry.request.is_some()).then_some(RemoteLease {
                         flow,
                         scope,
@@ -388,6 +394,13 @@ impl Registry {
     pub fn is_in_step_with(&self, flow: &FlowId) -> bool {
         self.remotes.get(flow).is_some_and(Remote::is_in_step)
     }
+}
+
+/// The ROS 2 network that a flow says it is on; without an address there it is on none.
+fn ros2_network(hello: &Hello) -> Option<Ros2Network> {
+    let address = hello.ros2_address.parse().ok()?;
+    let id = Ros2NetworkId(hello.ros2_network);
+    (hello.ros2_network != 0).then_some(Ros2Network { id, address })
 }
 
 fn is_reachable(remote: &Remote) -> bool {

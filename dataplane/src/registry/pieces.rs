@@ -48,6 +48,7 @@ fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
         with(&|atom| atom.node_advertise.clone_from(&entry.node_advertise)),
         with(&|atom| atom.layer_advertise.clone_from(&entry.layer_advertise)),
         with(&|atom| atom.outside_advertise.clone_from(&entry.outside_advertise)),
+        with(&|atom| atom.ros2_advertise.clone_from(&entry.ros2_advertise)),
     ];
     let mut request = |request: Option<&wire::Request>,
                        place: fn(&mut wire::Entry, wire::Request)| {
@@ -67,6 +68,9 @@ fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
     });
     request(entry.outside_request.as_ref(), |atom, request| {
         atom.outside_request = Some(request);
+    });
+    request(entry.ros2_request.as_ref(), |atom, request| {
+        atom.ros2_request = Some(request);
     });
     let route = |route: &wire::RouteState| with(&|atom| atom.route_state.push(route.clone()));
     atoms.extend(entry.route_state.iter().map(route));
@@ -90,6 +94,8 @@ fn absorb(into: &mut wire::Entry, piece: wire::Entry) {
     request(&mut into.layer_request, piece.layer_request);
     into.outside_advertise = into.outside_advertise.take().or(piece.outside_advertise);
     request(&mut into.outside_request, piece.outside_request);
+    into.ros2_advertise = into.ros2_advertise.take().or(piece.ros2_advertise);
+    request(&mut into.ros2_request, piece.ros2_request);
     into.route_state.extend(piece.route_state);
 }
 
@@ -132,10 +138,11 @@ pub(crate) fn entry_hash(entry: &wire::Entry) -> u64 {
     let mut entry = entry.clone();
     let requests = [&mut entry.node_request, &mut entry.layer_request, &mut entry.outside_request];
     for request in requests.into_iter().flatten() {
-        // For people alone: flows of earlier versions do not know who asks.
+        // Flows of earlier versions do not know these.
         request.services.clear();
-        request.more_services = 0;
+        (request.more_services, request.json, request.unframed) = (0, false, false);
     }
+    (entry.ros2_advertise, entry.ros2_request) = (None, None);
     text_hash(&entry.encode_to_vec())
 }
 

@@ -349,13 +349,13 @@ impl Remote {
             let old = self.entries.insert(topic.clone(), new);
             self.digest =
                 self.digest.wrapping_add(hash).wrapping_sub(old.as_ref().map_or(0, |old| old.hash));
-            if merged.is_empty() {
-                topics.remove(&topic);
-            } else {
-                topics.insert(topic.clone(), merged);
+            let before = topics.remove(&topic).unwrap_or_default();
+            // Not all of it is in the hash.
+            if old.is_none_or(|old| old.hash != hash) || before != merged {
+                changed.insert(topic.clone());
             }
-            if old.is_none_or(|old| old.hash != hash) {
-                changed.insert(topic);
+            if !merged.is_empty() {
+                topics.insert(topic, merged);
             }
         }
         for topic in gone {

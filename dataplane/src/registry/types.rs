@@ -58,7 +58,9 @@ impl EventDraft {
     /// The event as it is published, at a wall-clock time in milliseconds since 1970.
     #[must_use]
     pub fn stamp(&self, flow: &FlowId, unix_ms: u64) -> Event {
-        Event::new(self.event, flow, self.topic.as_ref(), self.code, unix_ms)
+        let event = Event::new(self.event, flow, self.topic.as_ref(), self.code, unix_ms);
+        let told = self.event == EventKind::ConvertFailed;
+        Event { detail: if told { self.detail.clone() } else { String::new() }, ..event }
     }
 }
 

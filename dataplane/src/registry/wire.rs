@@ -56,6 +56,8 @@ pub(super) fn to_wire(
         route_state: routes.iter().take(MAX_ROUTES).map(trim_route).collect(),
         outside_advertise: entry.outside.advertise.as_ref().map(advertise_to_wire),
         outside_request: entry.outside.request.as_ref().map(request_to_wire),
+        ros2_advertise: entry.ros2.advertise.as_ref().map(advertise_to_wire),
+        ros2_request: entry.ros2.request.as_ref().map(request_to_wire),
     }
 }
 
@@ -105,6 +107,8 @@ fn request_to_wire(request: &Request) -> wire::Request {
         from: Vec::new(),
         r#type: request.type_name.clone(),
         type_hash: request.type_hash.clone(),
+        json: request.json,
+        unframed: !request.framed,
         services: Vec::new(),
         // Set while measuring, so that setting it later does not make the message longer.
         more_services: u32::MAX,
@@ -167,6 +171,7 @@ pub(super) fn from_wire(entry: &wire::Entry) -> Result<(TopicName, TopicEntry), 
     let merged = TopicEntry {
         node: scope(entry.node_advertise.as_ref(), entry.node_request.as_ref())?,
         layer: scope(entry.layer_advertise.as_ref(), entry.layer_request.as_ref())?,
+        ros2: scope(entry.ros2_advertise.as_ref(), entry.ros2_request.as_ref())?,
         outside: scope(entry.outside_advertise.as_ref(), entry.outside_request.as_ref())?,
     };
     Ok((topic, merged))
@@ -253,9 +258,10 @@ fn request_from_wire(message: &wire::Request) -> Result<Request, EntryFault> {
         type_hash: message.type_hash.clone(),
         services: sources_from_wire(&message.services, MAX_REQUESTERS)?,
         more_services: message.more_services,
-        // How a scope of another flow is served is that flow's affair.
-        framed: true,
+        framed: !message.unframed,
+        // What a flow copies on its node scope is its affair.
         bare: false,
+        json: message.json,
     })
 }
 

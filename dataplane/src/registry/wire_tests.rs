@@ -68,8 +68,9 @@ fn any_request() -> impl Strategy<Value = Request> {
             type_hash,
             services: who.0.into_iter().map(|(node, service)| Source { node, service }).collect(),
             more_services: who.1,
-            framed: true,
+            framed: who.1 % 2 == 0,
             bare: false,
+            json: who.1 % 3 == 0,
         })
 }
 
@@ -88,9 +89,16 @@ fn any_entry() -> impl Strategy<Value = (TopicName, TopicEntry, Vec<wire::RouteS
             next_offset,
         },
     );
-    (text(200), scope(), scope(), scope(), proptest::collection::vec(route, 0..=MAX_ROUTES))
-        .prop_map(|(topic, node, layer, outside, routes)| {
-            (topic.parse().unwrap(), TopicEntry { node, layer, outside }, routes)
+    (
+        text(200),
+        scope(),
+        scope(),
+        scope(),
+        scope(),
+        proptest::collection::vec(route, 0..=MAX_ROUTES),
+    )
+        .prop_map(|(topic, node, layer, ros2, outside, routes)| {
+            (topic.parse().unwrap(), TopicEntry { node, layer, ros2, outside }, routes)
         })
 }
 
@@ -133,6 +141,7 @@ proptest! {
             let scopes = [
                 (&mut expected.node, &back.node),
                 (&mut expected.layer, &back.layer),
+                (&mut expected.ros2, &back.ros2),
                 (&mut expected.outside, &back.outside),
             ];
             for (expected, back) in scopes {
@@ -199,6 +208,25 @@ fn names_of_requesters_are_no_part_of_the_digest() {
     };
     let named = wire::Source { node: String::new(), service: "dashboard".into() };
     assert_eq!(entry_hash(&entry(vec![named], 7)), entry_hash(&entry(Vec::new(), 0)));
+}
+
+/// Flows of earlier versions reckon it without them.
+#[test]
+fn what_is_told_of_ros2_and_json_is_no_part_of_the_digest() {
+    let plain = wire::Entry {
+        topic: "a".into(),
+        layer_request: Some(wire::Request::default()),
+        ..wire::Entry::default()
+    };
+    let request = wire::Request { json: true, unframed: true, ..wire::Request::default() };
+    let more = wire::Entry {
+        layer_request: Some(request),
+        ros2_advertise: Some(wire::Advertise::default()),
+        ros2_request: Some(wire::Request::default()),
+        ..plain.clone()
+    };
+    assert_eq!(entry_hash(&plain), entry_hash(&more));
+    assert_eq!(from_wire(&plain).unwrap().1.ros2, ScopeEntry::default());
 }
 
 #[test]

@@ -19,6 +19,7 @@ pub use facts::{
     BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, WhyInput, WhyTarget,
 };
 
+use crate::plan::network::Network;
 use crate::plan::{Group, Pairing, Publisher, Requester, TopicView};
 use crate::world::{FlowState, FlowView, Reach};
 use trace::{Trace, Tracer, fault};
@@ -193,7 +194,7 @@ impl<'w> Explainer<'_, 'w> {
         let mut found: Vec<Publisher<'w>> = Vec::new();
         for publisher in &self.view.publishers {
             let same = |other: &Publisher<'_>| {
-                publisher.scope != Scope::Node
+                !publisher.is_of_flow()
                     && other.scope == publisher.scope
                     && other.group == publisher.group
             };
@@ -212,7 +213,8 @@ impl<'w> Explainer<'_, 'w> {
         let lost = self.input.world.flows.iter().find(|(_, flow)| {
             let entry = flow.topics.get(self.input.topic);
             entry.is_some_and(|entry| {
-                entry.node.advertise.is_some() || entry.layer.advertise.is_some()
+                let offers = [&entry.node, &entry.layer, &entry.ros2];
+                offers.iter().any(|offer| offer.advertise.is_some())
             })
         });
         let (flow, code, detail) = match lost {
@@ -236,7 +238,7 @@ impl<'w> Explainer<'_, 'w> {
         let all: Vec<Requester<'w>> = living.chain(self.silent_requesters()).collect();
         for requester in all.iter().filter(|requester| self.is_asked(requester, &all)) {
             let shared = |other: &Requester<'_>| {
-                requester.scope != Scope::Node
+                !is_of_flow(requester)
                     && other.scope == requester.scope
                     && other.group == requester.group
             };
@@ -269,15 +271,21 @@ impl<'w> Explainer<'_, 'w> {
             let Some(entry) = flow.topics.get(self.input.topic) else {
                 continue;
             };
-            for (scope, entry) in [(Scope::Node, &entry.node), (Scope::Layer, &entry.layer)] {
-                let group = Group::of(id, flow);
-                // What a lost flow said of a layer scope counts only while nobody else is there to
-                // know better.
-                let known = scope == Scope::Layer && self.has_living(group);
+            let (group, network) = (Group::of(id, flow), Network::of(id, flow));
+            for (scope, entry) in entry.scopes() {
+                // What a lost flow said of a layer scope or a network counts only while nobody else
+                // is there to know better.
+                let known = match scope {
+                    Scope::Node => false,
+                    Scope::Layer => self.has_living(group),
+                    Scope::Ros2 => network.is_none_or(|network| self.view.has_flows(network)),
+                    Scope::Inter => true,
+                };
                 silent.extend(entry.request.as_ref().filter(|_| !known).map(|request| Requester {
                     flow: id,
                     group,
                     scope,
+                    network,
                     request,
                 }));
             }
@@ -298,12 +306,13 @@ impl<'w> Explainer<'_, 'w> {
             // A gateway does not say which layers it speaks for.
             return to.layer != self.view.me.layer;
         }
-        let in_node = |requester: &Requester<'_>| {
+        let in_node = |requester: &Requester<'w>| {
+            let flows = self.view.flows_behind(requester);
             requester.flow.layer == to.layer
-                && to.node.as_ref().is_none_or(|node| requester.flow.node == *node)
+                && to.node.as_ref().is_none_or(|node| flows.iter().any(|flow| flow.node == *node))
         };
-        let node_asks = || all.iter().any(|other| other.scope == Scope::Node && in_node(other));
-        in_node(requester) && (to.node.is_none() || requester.scope == Scope::Node || !node_asks())
+        let node_asks = || all.iter().any(|other| is_of_flow(other) && in_node(other));
+        in_node(requester) && (to.node.is_none() || is_of_flow(requester) || !node_asks())
     }
 
     /// Why a lease is missing: nobody is heard on a scope that is another flow's or whose broker is
@@ -372,6 +381,11 @@ fn pairs_of<'w>(
     let all =
         if wanted.is_empty() { publishers.iter().filter(here).take(1).collect() } else { wanted };
     all.into_iter().take(limit).map(|publisher| tracer.trace(publisher, requester)).collect()
+}
+
+/// Whether a requester is on a node or a ROS 2 network.
+fn is_of_flow(requester: &Requester<'_>) -> bool {
+    matches!(requester.scope, Scope::Node | Scope::Ros2)
 }
 
 /// Why a flow carries nothing.

@@ -49,6 +49,13 @@ pub(super) fn remedy(code: WhyCode) -> &'static str {
         WhyCode::TypeMismatch => {
             "Let publisher and requester give the same `type` and `type_hash`, or leave them out."
         }
+        WhyCode::TypeUnknown => {
+            "Give the flow a folder with the definition of the type (`interfaces` of its ROS 2 \
+             plugin), or ask for the topic as CDR."
+        }
+        WhyCode::ConvertError => {
+            "Correct the message, or its type: the step names the place in it that does not fit."
+        }
         WhyCode::QosMismatch => {
             "It flows as offered: let the publisher advertise the reliability and durability that \
              is asked for."
@@ -94,6 +101,9 @@ pub(super) fn remedy(code: WhyCode) -> &'static str {
         }
         WhyCode::NameInUse => {
             "Stop one of the programs that the step names, or give it a `node.name` of its own."
+        }
+        WhyCode::Unreachable => {
+            "Let the ROS 2 node use UDP: over TCP or shared memory alone no flow reaches it."
         }
         WhyCode::NativePath => {
             "Nothing to do: publisher and requester reach each other without a bridge."

@@ -9,10 +9,10 @@ use super::{
     absence, absent,
 };
 use crate::plan::{
-    Blocked, Destination, Pairing, Publisher, Requester, Target, TopicView, asks_too_much,
+    Blocked, Destination, Form, Pairing, Publisher, Requester, Target, TopicView, asks_too_much,
     meets_directly, type_detail,
 };
-use crate::world::Reach;
+use crate::world::{Reach, Request};
 
 /// The steps of one pair, in the order of a message's way.
 pub(super) struct Trace {
@@ -50,14 +50,15 @@ impl Trace {
     pub(super) fn verdict(&self) -> Verdict {
         if self.steps.iter().any(|step| !step.ok) {
             Verdict::NotFlowing
-        } else if self.code() == WhyCode::Ok {
+        } else if matches!(self.code(), WhyCode::Ok | WhyCode::NativePath) {
             Verdict::Flowing
         } else {
             Verdict::Degraded
         }
     }
 
-    /// That of the first failing step, else the first that says that something is not as asked for.
+    /// That of the first failing step, else the first that says that something is not as asked for;
+    /// of what flows without a bridge, that.
     pub(super) fn code(&self) -> WhyCode {
         let failing = self.steps.iter().find(|step| !step.ok);
         let remark = || {
@@ -65,7 +66,8 @@ impl Trace {
                 !matches!(step.code, WhyCode::Ok | WhyCode::NativePath | WhyCode::NotOwner)
             })
         };
-        failing.or_else(remark).map_or(WhyCode::Ok, |step| step.code)
+        let native = || self.steps.iter().find(|step| step.code == WhyCode::NativePath);
+        failing.or_else(remark).or_else(native).map_or(WhyCode::Ok, |step| step.code)
     }
 }
 
@@ -141,6 +143,9 @@ impl<'w> Tracer<'_, 'w> {
                 WhyCode::QosMismatch,
                 "more is asked than offered: it flows as offered",
             );
+        } else if publisher.scope == Scope::Ros2 && publisher.shares_network(requester) {
+            let detail = "one ROS 2 network: no bridge is needed";
+            trace.add(flow, plan, true, WhyCode::NativePath, detail);
         } else if meets_directly(publisher, requester) {
             trace.pass(flow, plan, "one scope: no bridge is needed");
         } else {
@@ -209,27 +214,45 @@ impl<'w> Tracer<'_, 'w> {
     /// The bridges between a publisher and a requester that match.
     fn hops(&self, publisher: &Publisher<'w>, requester: &Requester<'w>) -> Vec<Hop<'w>> {
         let hop = |flow, from, to| Hop { flow, from, to };
-        let framed = requester.request.framed.then_some(Target::Node { bare: false });
-        let bare = requester.request.bare.then_some(Target::Node { bare: true });
-        let node =
-            |flow, from| framed.iter().chain(&bare).map(move |to| hop(flow, from, to.clone()));
+        let targets: Vec<Target> = match requester.scope {
+            Scope::Node => {
+                let forms = Form::ALL.into_iter().filter(|form| form.is_asked(requester.request));
+                forms.map(Target::Node).collect()
+            }
+            Scope::Ros2 => vec![Target::Ros2],
+            Scope::Layer | Scope::Inter => Vec::new(),
+        };
+        let last = |flow, from| targets.iter().map(move |to| hop(flow, from, to.clone()));
         let mut hops = Vec::new();
-        let on_node = requester.scope == Scope::Node;
         if meets_directly(publisher, requester)
-            || (publisher.flow, publisher.scope) == (requester.flow, requester.scope)
+            || publisher.is_of_flow()
+                && (publisher.flow, publisher.scope) == (requester.flow, requester.scope)
         {
-            // On one node a bare request alone needs a copy; framed ones read what is published.
-            hops.extend(
-                bare.filter(|_| on_node).map(|bare| hop(requester.flow, Scope::Node, bare)),
-            );
+            // On one node other forms need a copy; framed ones read what is published.
+            hops.extend(last(requester.flow, Scope::Node).filter(|hop| hop.to.is_headless()));
             return hops;
         }
+        let one_flow = publisher.flow == requester.flow && !targets.is_empty();
+        if publisher.is_of_flow() && (one_flow || publisher.shares_network(requester)) {
+            hops.extend(last(publisher.flow, publisher.scope));
+            return hops;
+        }
+        let layers: &[bool] = match (requester.scope, requester.request) {
+            (Scope::Layer, Request { framed: true, json: true, .. }) => &[false, true],
+            (Scope::Layer, Request { framed: false, json: true, .. }) => &[true],
+            _ => &[false],
+        };
+        let layer = |flow, from| {
+            layers.iter().map(move |json| hop(flow, from, Target::Layer { json: *json }))
+        };
         if publisher.group == requester.group {
-            hops.extend(
-                (publisher.scope == Scope::Node)
-                    .then(|| hop(publisher.flow, Scope::Node, Target::Layer)),
-            );
-            hops.extend(node(requester.flow, Scope::Layer).filter(|_| on_node));
+            if publisher.is_of_flow() {
+                hops.extend(layer(publisher.flow, publisher.scope));
+            } else if let Some(converter) = self.view.converter_in(publisher.group) {
+                let copies = layer(converter, Scope::Layer);
+                hops.extend(copies.filter(|hop| hop.to.is_json()));
+            }
+            hops.extend(last(requester.flow, Scope::Layer));
             return hops;
         }
         let sender = if publisher.scope == Scope::Layer {
@@ -243,11 +266,11 @@ impl<'w> Tracer<'_, 'w> {
         };
         let target = Target::Inter { layer: receiver.layer.clone(), receiver: receiver.clone() };
         hops.push(hop(sender, publisher.scope, target));
-        if on_node && requester.flow == receiver {
-            hops.extend(node(receiver, Scope::Inter));
+        if !targets.is_empty() && requester.flow == receiver {
+            hops.extend(last(receiver, Scope::Inter));
         } else {
-            hops.push(hop(receiver, Scope::Inter, Target::Layer));
-            hops.extend(node(requester.flow, Scope::Layer).filter(|_| on_node));
+            hops.extend(layer(receiver, Scope::Inter));
+            hops.extend(last(requester.flow, Scope::Layer));
         }
         hops
     }
@@ -297,7 +320,7 @@ impl<'w> Tracer<'_, 'w> {
     fn other_hop(&self, trace: &mut Trace, hop: &Hop<'w>) {
         let (to_layer, receiver) = match &hop.to {
             Target::Inter { layer, receiver } => (layer, Some(receiver)),
-            Target::Node { .. } | Target::Layer => (&hop.flow.layer, None),
+            Target::Node(_) | Target::Layer { .. } | Target::Ros2 => (&hop.flow.layer, None),
         };
         // A way that ends in the flow's own layer names the flow itself, or nobody where it is
         // blocked.
@@ -351,11 +374,7 @@ impl<'w> Tracer<'_, 'w> {
             }
         }
         trace.pass(flow, bridge, way);
-        let target = match hop.to {
-            Target::Node { .. } => Scope::Node,
-            Target::Layer => Scope::Layer,
-            Target::Inter { .. } => Scope::Inter,
-        };
+        let target = hop.to.scope();
         // A broker that is away explains what was dropped on the way to it.
         if let Some((code, detail)) = self.broker(target).and_then(fault) {
             return trace.fail(flow, StepKind::Deliver, code, detail);
@@ -373,7 +392,7 @@ impl<'w> Tracer<'_, 'w> {
     /// Why this flow makes no bridge for a hop over the layer scope, if its broker cannot have the
     /// topic.
     fn blocked(&self, hop: &Hop<'w>) -> Option<&Blocked> {
-        let on_layer = hop.from == Scope::Layer || hop.to == Target::Layer;
+        let on_layer = hop.from == Scope::Layer || hop.to.scope() == Scope::Layer;
         let of_layer = |blocked: &&Blocked| {
             let layer = Destination::Layer(self.view.me.layer.clone());
             let of_name =
@@ -404,7 +423,7 @@ impl<'w> Tracer<'_, 'w> {
         match scope {
             Scope::Node => self.input.node_broker.as_ref(),
             Scope::Layer => self.input.layer_broker.as_ref(),
-            Scope::Inter => None,
+            Scope::Ros2 | Scope::Inter => None,
         }
     }
 }
@@ -447,6 +466,7 @@ fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
             DropReason::RateLimit => (StepKind::Admit, WhyCode::RateLimited),
             DropReason::TooLarge => (StepKind::Admit, WhyCode::TooLarge),
             DropReason::TypeMismatch => (StepKind::Admit, WhyCode::TypeMismatch),
+            DropReason::ConvertError => (StepKind::Deliver, WhyCode::ConvertError),
             DropReason::ForeignOrigin => (StepKind::Admit, WhyCode::SourceMismatch),
             DropReason::QueueFull => (last, WhyCode::RateLimited),
             DropReason::Lifespan => (last, WhyCode::Lifespan),
@@ -481,10 +501,10 @@ fn counts(facts: &BridgeFacts) -> String {
 
 pub(super) fn describe(target: &Target) -> String {
     match target {
-        Target::Node { bare: false } => "node".to_owned(),
-        Target::Node { bare: true } => "node (bare)".to_owned(),
-        Target::Layer => "layer".to_owned(),
+        Target::Node(Form::Bare) => "node (bare)".to_owned(),
         Target::Inter { receiver, .. } => format!("inter, {receiver}"),
+        local if local.is_json() => format!("{} (JSON)", local.scope()),
+        local => local.scope().to_string(),
     }
 }
 

@@ -145,6 +145,9 @@ pub struct Event {
     /// Error code or verdict; empty where there is none.
     #[serde(default)]
     pub code: String,
+    /// For people, with `convert_failed`; else empty.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub detail: String,
     /// When, RFC 3339 in UTC with milliseconds.
     pub time: String,
 }
@@ -164,6 +167,7 @@ impl Event {
             flow: flow.to_string(),
             topic: topic.map(ToString::to_string).unwrap_or_default(),
             code: code.to_owned(),
+            detail: String::new(),
             time: rfc3339_millis(unix_ms),
         }
     }

@@ -1,7 +1,7 @@
 //! Control messages as types, and as JSON.
 
 use serde::Serialize;
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::words::LeaseKind;
 use super::{DEFAULT_TTL_S, MAX_CONTROL_OBJECTS};
@@ -18,6 +18,8 @@ pub enum ControlMessage {
     Request(RequestMessage),
     /// It no longer does.
     Withdraw(WithdrawMessage),
+    /// It calls a ROS 2 service.
+    Call(CallMessage),
 }
 
 /// Fields of every control message.
@@ -120,6 +122,9 @@ pub struct RequestMessage {
     /// It wants payloads without a header.
     #[serde(skip_serializing_if = "is_default")]
     pub bare: bool,
+    /// It wants payloads as JSON.
+    #[serde(skip_serializing_if = "is_default")]
+    pub json: bool,
     /// Only messages of that origin.
     #[serde(skip_serializing_if = "is_default")]
     pub from: OriginSelector,
@@ -137,6 +142,18 @@ pub struct WithdrawMessage {
     /// Which lease; `None` = both.
     #[serde(skip_serializing_if = "is_default")]
     pub kind: Option<LeaseKind>,
+}
+
+/// A service calls a ROS 2 service, whose name is the topic; the answer brings the reply.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CallMessage {
+    /// Who and what; `id` and `reply_to` are given.
+    #[serde(flatten)]
+    pub common: Common,
+    /// Milliseconds that the reply is waited for.
+    pub timeout_ms: u32,
+    /// The request as a JSON object.
+    pub request: Map<String, Value>,
 }
 
 /// Origin that a request asks for; an absent part matches everything.
@@ -201,6 +218,7 @@ impl RequestMessage {
             ttl_s: DEFAULT_TTL_S,
             max_rate_hz: None,
             bare: false,
+            json: false,
             from: OriginSelector::default(),
             quality: Quality::default(),
         }
@@ -223,6 +241,7 @@ impl ControlMessage {
             Self::Advertise(message) => &message.common,
             Self::Request(message) => &message.common,
             Self::Withdraw(message) => &message.common,
+            Self::Call(message) => &message.common,
         }
     }
 
@@ -233,6 +252,7 @@ impl ControlMessage {
             Self::Advertise(message) => &mut message.common,
             Self::Request(message) => &mut message.common,
             Self::Withdraw(message) => &mut message.common,
+            Self::Call(message) => &mut message.common,
         }
     }
 

@@ -16,7 +16,7 @@ mod words;
 
 pub use answer::{Answer, ControlError, Event, rfc3339_millis};
 pub use message::{
-    AdvertiseMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage,
+    AdvertiseMessage, CallMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage,
     WithdrawMessage,
 };
 pub use parse::{ParsedObject, parse_payload};
@@ -38,6 +38,10 @@ pub const MAX_ENCODING_BYTES: usize = 200;
 pub const MAX_TYPE_BYTES: usize = 200;
 /// Longest `id` of a control message, in bytes.
 pub const MAX_ID_BYTES: usize = 256;
+/// Time that a call without `timeout_ms` waits for its reply, in milliseconds.
+pub const DEFAULT_CALL_TIMEOUT_MS: u32 = 5_000;
+/// Longest time that a call may wait for its reply, in milliseconds.
+pub const MAX_CALL_TIMEOUT_MS: u32 = 600_000;
 /// Media type of a topic whose publisher names none.
 pub const DEFAULT_ENCODING: &str = "application/octet-stream";
 /// Channels that may be named as `reply_to` begin so.

@@ -7,13 +7,14 @@ use serde_json::{Map, Value};
 
 use super::answer::ControlError;
 use super::message::{
-    AdvertiseMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage,
+    AdvertiseMessage, CallMessage, Common, ControlMessage, OriginSelector, Quality, RequestMessage,
     WithdrawMessage,
 };
 use super::words::ErrorCode;
 use super::{
-    DEFAULT_TTL_S, MAX_CONTROL_BYTES, MAX_CONTROL_OBJECTS, MAX_DEPTH, MAX_ENCODING_BYTES,
-    MAX_ID_BYTES, MAX_TTL_S, MAX_TYPE_BYTES, REPLY_PREFIX,
+    DEFAULT_CALL_TIMEOUT_MS, DEFAULT_TTL_S, MAX_CALL_TIMEOUT_MS, MAX_CONTROL_BYTES,
+    MAX_CONTROL_OBJECTS, MAX_DEPTH, MAX_ENCODING_BYTES, MAX_ID_BYTES, MAX_TTL_S, MAX_TYPE_BYTES,
+    REPLY_PREFIX,
 };
 use crate::names::{ChannelName, InstanceName, NameError, TopicName};
 use crate::qos::{Durability, Reliability};
@@ -133,12 +134,14 @@ fn parse_message(
             ttl_s: fields.ttl()?,
             max_rate_hz: fields.positive("max_rate_hz")?,
             bare: fields.boolean("bare")?.unwrap_or(false),
+            json: fields.boolean("json")?.unwrap_or(false),
             from: fields.from()?,
             quality: fields.quality()?,
         }),
         Op::Withdraw => {
             ControlMessage::Withdraw(WithdrawMessage { common, kind: fields.word("kind")? })
         }
+        Op::Call => fields.call(common)?,
     })
 }
 
@@ -147,6 +150,7 @@ enum Op {
     Advertise,
     Request,
     Withdraw,
+    Call,
 }
 
 /// The fields of one object. `null` is as good as absent.
@@ -174,7 +178,8 @@ impl Fields<'_> {
                 "advertise" => Ok(Op::Advertise),
                 "request" => Ok(Op::Request),
                 "withdraw" => Ok(Op::Withdraw),
-                other => Err(format!("{other:?} is not one of advertise, request, withdraw")),
+                "call" => Ok(Op::Call),
+                other => Err(format!("{other:?} is not one of advertise, request, withdraw, call")),
             },
             Some(_) => Err("must be a text".to_owned()),
             None => Err("is missing".to_owned()),
@@ -306,6 +311,23 @@ impl Fields<'_> {
             }
             Some(_) => Err(self.wrong("from", "an object")),
         }
+    }
+
+    /// A call; without `id` and `reply_to` nobody would get the reply.
+    fn call(&self, common: Common) -> Result<ControlMessage, ControlError> {
+        for (key, there) in [("id", common.id.is_some()), ("reply_to", common.reply_to.is_some())] {
+            if !there {
+                return Err(self.error(ErrorCode::InvalidValue, key, "is missing"));
+            }
+        }
+        let timeout = self.small_integer("timeout_ms", 1, MAX_CALL_TIMEOUT_MS)?;
+        let request = match self.get("request") {
+            Some(Value::Object(request)) => request.clone(),
+            Some(_) => return Err(self.wrong("request", "an object")),
+            None => return Err(self.error(ErrorCode::InvalidValue, "request", "is missing")),
+        };
+        let timeout_ms = timeout.unwrap_or(DEFAULT_CALL_TIMEOUT_MS);
+        Ok(ControlMessage::Call(CallMessage { common, timeout_ms, request }))
     }
 
     fn quality(&self) -> Result<Quality, ControlError> {

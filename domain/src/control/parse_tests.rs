@@ -135,6 +135,7 @@ fn every_fault_has_its_code_and_place() {
         ("request", "from", json!({"node": 1}), bad, "/from/node"),
         ("request", "from", json!({"service": ""}), bad, "/from/service"),
         ("request", "bare", json!(1), bad, "/bare"),
+        ("request", "json", json!("yes"), bad, "/json"),
         ("request", "max_rate_hz", json!(0), bad, "/max_rate_hz"),
         ("withdraw", "kind", json!("both"), bad, "/kind"),
         ("withdraw", "kind", json!(1), bad, "/kind"),
@@ -191,6 +192,27 @@ fn every_fault_has_its_code_and_place() {
 
 fn null_text() -> String {
     "volatile\u{0}".into()
+}
+
+#[test]
+fn calls_need_somebody_who_gets_the_reply() {
+    let call = json!({"op": "call", "topic": "add_two_ints", "service": "planner", "id": "7",
+        "reply_to": "blaze/reply/planner", "request": {"a": 1}});
+    let ControlMessage::Call(read) = message(&call) else { panic!("not a call") };
+    assert_eq!((read.timeout_ms, &read.request["a"]), (5_000, &json!(1)));
+    for (key, value) in [
+        ("id", Value::Null),
+        ("reply_to", Value::Null),
+        ("request", Value::Null),
+        ("request", json!([1])),
+        ("timeout_ms", json!(0)),
+        ("timeout_ms", json!(600_001)),
+    ] {
+        let mut faulty = call.clone();
+        faulty[key] = value;
+        let error = one(&faulty).message.unwrap_err();
+        assert_eq!((error.code, error.pointer), (ErrorCode::InvalidValue, format!("/{key}")));
+    }
 }
 
 #[test]
@@ -311,7 +333,7 @@ fn any_message() -> impl Strategy<Value = ControlMessage> {
         0..=MAX_TTL_S,
         proptest::option::of(1e-6..1e6_f64),
         proptest::option::of(any::<u64>()),
-        0..3_u8,
+        0..4_u8,
     )
         .prop_map(|(common, quality, ttl_s, rate, max_bytes, op)| match op {
             0 => ControlMessage::Advertise(AdvertiseMessage {
@@ -331,11 +353,21 @@ fn any_message() -> impl Strategy<Value = ControlMessage> {
                 ttl_s,
                 max_rate_hz: rate,
                 bare: max_bytes.is_some(),
+                json: ttl_s % 2 == 1,
                 quality,
             }),
-            _ => ControlMessage::Withdraw(WithdrawMessage {
+            2 => ControlMessage::Withdraw(WithdrawMessage {
                 common,
                 kind: max_bytes.map(|_| LeaseKind::Advertise),
+            }),
+            _ => ControlMessage::Call(CallMessage {
+                common: Common {
+                    id: Some("7".to_owned()),
+                    reply_to: "blaze/reply/x".parse().ok(),
+                    ..common
+                },
+                timeout_ms: ttl_s + 1,
+                request: Map::from_iter([("a".to_owned(), json!(max_bytes))]),
             }),
         })
 }

@@ -37,6 +37,18 @@ word_enum!(
         NameCollision = "name_collision",
         /// Not allowed.
         AccessDenied = "access_denied",
+        /// No server of the called service is known.
+        NoServer = "no_server",
+        /// The server did not reply in time.
+        Timeout = "timeout",
+        /// Nobody has the definition of the type.
+        TypeUnknown = "type_unknown",
+        /// The JSON does not fit the type.
+        ConvertError = "convert_error",
+        /// The flow waits for as many replies as it may.
+        TooManyCalls = "too_many_calls",
+        /// Larger than a call may be.
+        TooLarge = "too_large",
     }
 );
 
@@ -53,5 +65,7 @@ word_enum!(
         RouteUp = "route_up",
         /// A topic has lost a route.
         RouteDown = "route_down",
+        /// A message could not be converted.
+        ConvertFailed = "convert_failed",
     }
 );

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::readers::{formed, free_text, parsed, path, text, whole};
 use super::walk::{Node, Section};
-use super::{SecretText, TopicPattern, url};
+use super::{Ros2Plugin, SecretText, url};
 use crate::qos::word_enum;
 
 /// Highest DDS domain whose ports stay below the range that systems give out by themselves.
@@ -26,8 +26,8 @@ pub struct Brokers {
     pub layer: Option<LayerBroker>,
     /// The network of flows.
     pub inter: Option<InterDds>,
-    /// Further worlds that are bridged.
-    pub plugins: Vec<Ros2Plugin>,
+    /// The ROS 2 network that is bridged: the entry of `plugins`.
+    pub ros2: Option<Ros2Plugin>,
 }
 
 impl Brokers {
@@ -47,9 +47,7 @@ impl Brokers {
                 ])
             }),
             inter: s.sub("inter", |s| s.one_of(&[("dds", InterDds::section)])),
-            plugins: s.list("plugins", |node| {
-                node.section(|s| s.one_of(&[("ros2", Ros2Plugin::section)])).flatten()
-            }),
+            ros2: s.opt("plugins", plugins).flatten(),
         }
     }
 
@@ -61,6 +59,18 @@ impl Brokers {
             Some(LayerBroker::Kafka(_) | LayerBroker::Memory) | None => None,
         }
     }
+}
+
+/// A flow is on one ROS 2 network: a second entry is a fault.
+fn plugins(node: &Node<'_>) -> Option<Option<Ros2Plugin>> {
+    let entry =
+        |node: &Node<'_>| node.section(|s| s.one_of(&[("ros2", Ros2Plugin::section)])).flatten();
+    let mut entries = node.list(entry)?.into_iter();
+    let first = entries.next();
+    for other in entries {
+        node.at(other.path).fault::<()>("is a second one; a flow is on one ROS 2 network");
+    }
+    Some(first)
 }
 
 /// Broker of the node scope.
@@ -221,55 +231,7 @@ word_enum!(
     }
 );
 
-word_enum!(
-    /// Release of ROS 2 whose types are expected.
-    Ros2Distro {
-        /// May 2022.
-        Humble = "humble",
-        /// May 2023.
-        Iron = "iron",
-        /// May 2024.
-        Jazzy = "jazzy",
-        /// May 2025.
-        Kilted = "kilted",
-        /// May 2026.
-        Lyrical = "lyrical",
-        /// The development branch.
-        Rolling = "rolling",
-    }
-);
-
-/// A ROS 2 domain that is bridged.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Ros2Plugin {
-    /// Where it stands in the file.
-    pub(super) path: String,
-    /// `ROS_DOMAIN_ID`, 0 to 100.
-    pub domain: u16,
-    /// Address of the interface; loopback and the node's own if absent.
-    pub interface: Option<Ipv4Addr>,
-    /// Release of ROS 2.
-    pub distro: Ros2Distro,
-    /// Topics that may be bridged.
-    pub allow: Vec<TopicPattern>,
-    /// Topics that are not, whatever `allow` says.
-    pub deny: Vec<TopicPattern>,
-}
-
-impl Ros2Plugin {
-    fn section(s: &mut Section<'_>) -> Option<Self> {
-        Some(Self {
-            path: s.node.path.clone(),
-            domain: s.or("domain", whole(0, MAX_DDS_DOMAIN), 0),
-            interface: s.opt("interface", address),
-            distro: s.or("distro", parsed, Ros2Distro::Jazzy),
-            allow: s.or("allow", |node| node.list(parsed), vec![TopicPattern::all()]),
-            deny: s.list("deny", parsed),
-        })
-    }
-}
-
-fn address(node: &Node<'_>) -> Option<Ipv4Addr> {
+pub(super) fn address(node: &Node<'_>) -> Option<Ipv4Addr> {
     let is_of_host = |address: &Ipv4Addr| {
         !(address.is_unspecified() || address.is_multicast() || address.is_broadcast())
     };

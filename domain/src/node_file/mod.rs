@@ -17,6 +17,7 @@ mod flow;
 mod pattern;
 mod plan_file;
 mod readers;
+mod ros2;
 mod services;
 #[cfg(test)]
 mod tests;
@@ -32,7 +33,7 @@ pub use access::{
 };
 pub use brokers::{
     Brokers, Chunking, DdsLayerBroker, InterDds, KafkaBroker, LayerBroker, MAX_DDS_DOMAIN, MIN_MTU,
-    NodeBroker, RedisBroker, RedisTls, Ros2Distro, Ros2Plugin,
+    NodeBroker, RedisBroker, RedisTls,
 };
 pub use control_plane::{
     AuthSection, ControlPlaneSection, EncryptionKey, EncryptionSection, GrpcSection,
@@ -45,6 +46,7 @@ pub use flow::{
 };
 pub use pattern::{PatternError, TopicPattern};
 pub use plan_file::{FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedLane, PlannedTopic};
+pub use ros2::{Ros2Distro, Ros2Live, Ros2Plugin};
 pub use services::{
     AdminSection, CacheSection, ConfigSection, DatabaseSection, LogFormat, LogSection,
     MongoSection, MonitorSection, WorkerSection,
@@ -254,7 +256,7 @@ impl NodeFile {
     /// Two roles in one DDS domain would hear each other: every domain of the file differs.
     fn check_domains(&self, report: &Report) {
         let mut seen: Vec<(u16, String)> = Vec::new();
-        let plugins = self.brokers.plugins.iter();
+        let ros2 = self.brokers.ros2.iter();
         let given = [
             self.brokers
                 .layer_domain()
@@ -266,7 +268,7 @@ impl NodeFile {
         ]
         .into_iter()
         .flatten()
-        .chain(plugins.map(|plugin| (plugin.domain, plugin.path.clone() + ".domain")));
+        .chain(ros2.map(|plugin| (plugin.domain, plugin.path.clone() + ".domain")));
         for (domain, path) in given {
             if let Some((_, other)) = seen.iter().find(|(used, _)| *used == domain) {
                 let detail =

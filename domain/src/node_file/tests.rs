@@ -224,16 +224,54 @@ fn all_faults_come_at_once() {
 fn domains_differ() {
     let mut tree = example();
     tree["brokers"]["inter"]["dds"]["domain"] = json!(10);
-    tree["brokers"]["plugins"] = json!([{ "ros2": { "domain": 3 } }, { "ros2": { "domain": 10 } }]);
+    tree["brokers"]["plugins"] = json!([{ "ros2": { "domain": 10 } }]);
     assert_eq!(
         faults(&tree),
         [
             "brokers.inter.dds.domain: 10 is also brokers.layer.dds.domain; all DDS domains of a \
              node file differ",
-            "brokers.plugins[1].ros2.domain: 10 is also brokers.layer.dds.domain; all DDS domains \
+            "brokers.plugins[0].ros2.domain: 10 is also brokers.layer.dds.domain; all DDS domains \
              of a node file differ",
         ]
     );
+}
+
+#[test]
+fn the_ros2_network() {
+    let read = |ros2: Value| {
+        let tree = json!({ "brokers": { "plugins": [{ "ros2": ros2 }] } });
+        NodeFile::read(&tree).map(|(file, _)| file.brokers.ros2.unwrap())
+    };
+    let plain = read(Value::Null).unwrap();
+    assert_eq!((plain.domain, plain.interface), (0, std::net::Ipv4Addr::LOCALHOST));
+    assert_eq!((plain.distro, &plain.namespace), (Ros2Distro::Jazzy, &None));
+    assert!(plain.live.announce && !plain.live.system && plain.peers.is_empty());
+    let given = read(json!({ "domain": 100, "interface": "10.0.1.1", "peers": ["10.0.1.2"],
+        "distro": "humble", "namespace": "arm/left", "allow": ["scan"], "deny": ["*/secret"],
+        "system": true, "announce": false, "interfaces": ["/opt/ros/jazzy/share"] }));
+    let given = given.unwrap();
+    assert_eq!(given.namespace.unwrap().as_str(), "arm/left");
+    assert!(given.live.system && !given.live.announce && given.live.interfaces.len() == 1);
+    assert_eq!(read(json!({ "namespace": "" })).unwrap().namespace, None);
+    for (key, value, detail) in [
+        ("domain", json!(101), "101 is not a whole number from 0 to 100"),
+        ("interface", json!("0.0.0.0"), "\"0.0.0.0\" is not the IPv4 address of one host"),
+        ("peers", json!(vec!["10.0.0.1"; 65]), "has 65 entries, at most 64 are allowed"),
+        ("distro", json!("foxy"), "\"foxy\" is not one of"),
+        ("namespace", json!("/arm"), "\"/arm\" has an empty segment"),
+        ("namespace", json!("blaze/x"), "\"blaze/x\" is reserved"),
+        ("deny", json!(["/scan"]), "\"/scan\" has an empty segment"),
+        ("system", json!("no"), "expected true or false, found text"),
+        ("anounce", json!(true), "unknown key; did you mean announce?"),
+    ] {
+        let faults = read(json!({ key: value })).unwrap_err();
+        assert_eq!(faults.len(), 1, "{key}: {faults:?}");
+        assert!(faults[0].path.starts_with(&format!("brokers.plugins[0].ros2.{key}")));
+        assert!(faults[0].detail.starts_with(detail), "{key}: {}", faults[0].detail);
+    }
+    let tree = json!({ "brokers": { "plugins": [{ "ros2": {} }, { "ros2": { "domain": 3 } }] } });
+    let two = faults(&tree);
+    assert_eq!(two, ["brokers.plugins[1].ros2: is a second one; a flow is on one ROS 2 network"]);
 }
 
 #[test]

@@ -36,6 +36,10 @@ pub struct Header {
     pub reliable: bool,
     /// Samples kept per writer; 0 = volatile.
     pub depth: u32,
+    /// Of a reply: writer and sequence of the request that it answers.
+    pub related: Option<(WriterId, u64)>,
+    /// The flow, `layer/node`, that alone writes it to ROS 2, or empty.
+    pub to: String,
 }
 
 impl Header {
@@ -63,10 +67,13 @@ impl Header {
             traceparent: String::new(),
             reliable: false,
             depth: 0,
+            related: None,
+            to: String::new(),
         }
     }
 
     pub(super) fn to_wire(&self) -> v1::MessageHeader {
+        let bytes = |writer: &WriterId| Bytes::copy_from_slice(&writer.0);
         v1::MessageHeader {
             topic: self.topic.clone(),
             origin: Some(v1::Origin {
@@ -76,7 +83,7 @@ impl Header {
                 instance: self.origin.instance.clone(),
                 epoch: self.origin.epoch,
             }),
-            writer: Bytes::copy_from_slice(&self.writer.0),
+            writer: bytes(&self.writer),
             sequence: self.sequence,
             publish_time_ns: self.publish_time_ns,
             encoding: self.encoding.clone(),
@@ -90,6 +97,9 @@ impl Header {
             traceparent: self.traceparent.clone(),
             reliable: self.reliable,
             depth: self.depth,
+            related_writer: self.related.map(|(writer, _)| bytes(&writer)).unwrap_or_default(),
+            related_sequence: self.related.map_or(0, |(_, sequence)| sequence),
+            to: self.to.clone(),
         }
     }
 }

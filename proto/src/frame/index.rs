@@ -29,6 +29,9 @@ pub(super) struct Index {
     pub(super) priority: i32,
     pub(super) reliable: bool,
     pub(super) depth: u32,
+    pub(super) related_writer: Option<WriterId>,
+    pub(super) related_sequence: u64,
+    pub(super) to: Range<u16>,
     /// Where hops and age stand in the header, to be left out when they are written anew.
     pub(super) hops_at: Range<u16>,
     pub(super) age_at: Range<u16>,
@@ -122,11 +125,7 @@ impl Index {
                 (1, Value::Bytes(place)) => index.topic = utf8(header, place, "topic")?,
                 (2, Value::Bytes(place)) => index.read_origin(header, &place)?,
                 (3, Value::Bytes(place)) => {
-                    let bytes = &header[usize_range(&place)];
-                    index.writer = WriterId(bytes.try_into().map_err(|_| FrameError::Field {
-                        field: "writer",
-                        reason: "must have 16 bytes",
-                    })?);
+                    index.writer = writer(header, &place, "writer")?;
                     has_writer = true;
                 }
                 (4, Value::Varint(value)) => index.sequence = value,
@@ -158,7 +157,14 @@ impl Index {
                 (16, Value::Varint(value)) => {
                     index.depth = u32::try_from(value).unwrap_or(u32::MAX);
                 }
-                (1..=16, _) => {
+                // Empty is as good as absent.
+                (17, Value::Bytes(place)) if place.is_empty() => {}
+                (17, Value::Bytes(place)) => {
+                    index.related_writer = Some(writer(header, &place, "related_writer")?);
+                }
+                (18, Value::Varint(value)) => index.related_sequence = value,
+                (19, Value::Bytes(place)) => index.to = utf8(header, place, "to")?,
+                (1..=19, _) => {
                     return Err(FrameError::Header(format!("field {tag} has the wrong wire type")));
                 }
                 _ => {} // a newer version may have more fields
@@ -196,6 +202,11 @@ impl Index {
         }
         Ok(())
     }
+}
+
+fn writer(header: &[u8], place: &Range<u16>, field: &'static str) -> Result<WriterId, FrameError> {
+    let bytes = header[usize_range(place)].try_into();
+    bytes.map(WriterId).map_err(|_| FrameError::Field { field, reason: "must have 16 bytes" })
 }
 
 fn utf8(header: &[u8], place: Range<u16>, field: &'static str) -> Result<Range<u16>, FrameError> {

@@ -15,6 +15,8 @@ fn header() -> Header {
         depth: 3,
         hops: 1,
         age_us: 77,
+        related: Some((WriterId([7; 16]), 5)),
+        to: "edge/robot-2".into(),
         ..Header::new(
             "imu/data",
             Origin {
@@ -45,7 +47,23 @@ fn every_field_survives() {
     assert_eq!((frame.lifespan_ms(), frame.priority()), (500, Some(Priority::State)));
     assert_eq!((frame.reliable(), frame.depth()), (true, 3));
     assert_eq!((frame.hops(), frame.age_us()), (1, 77));
+    assert_eq!((frame.related(), frame.to()), (header.related, "edge/robot-2"));
     assert_eq!(&frame.payload()[..], b"payload");
+}
+
+#[test]
+fn a_message_of_an_earlier_version_answers_nothing_and_is_for_any_flow() {
+    let frame = Frame::new(&Header { related: None, to: String::new(), ..header() }, Bytes::new());
+    let frame = frame.unwrap();
+    assert_eq!((frame.related(), frame.to()), (None, ""));
+    let short =
+        v1::MessageHeader { related_writer: Bytes::from_static(b"short"), ..header().to_wire() };
+    let mut head = BytesMut::from(&MAGIC[..]);
+    head.put_u32_le(u32::try_from(short.encoded_len()).unwrap());
+    short.encode(&mut head).unwrap();
+    let error = Frame::from_parts(head.freeze(), Bytes::new()).unwrap_err();
+    let reason = "must have 16 bytes";
+    assert_eq!(error, FrameError::Field { field: "related_writer", reason });
 }
 
 #[test]

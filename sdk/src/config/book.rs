@@ -224,7 +224,7 @@ impl ConfigBook {
             (Some(own), _) => notice.node.as_ref() == Some(own),
             // On the broker of a node all is for that node.
             (None, Scope::Node) => true,
-            (None, Scope::Layer | Scope::Inter) => notice.node.is_none(),
+            (None, Scope::Layer | Scope::Ros2 | Scope::Inter) => notice.node.is_none(),
         };
         of_node
             && notice.service == self.identity.service.as_str()

@@ -135,7 +135,7 @@ impl LeaseBook {
                 request.ttl_s = self.ttl_s;
                 LeaseKind::Request
             }
-            ControlMessage::Withdraw(_) => {
+            ControlMessage::Withdraw(_) | ControlMessage::Call(_) => {
                 return Err(FlowError::Invalid { field: "op", reason: "is no lease" });
             }
         };

@@ -1,6 +1,6 @@
 //! Subscribed channels: their DDS readers, and the threads that empty them.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
 use std::task::{Wake, Waker};
@@ -11,14 +11,15 @@ use parking_lot::{Mutex, RwLock};
 use rustdds::Timestamp;
 use tokio::sync::oneshot;
 
-use super::Topic;
 use super::deliver::{Kind, Progress, deliver};
 use super::kept::History;
 use super::seen::Seen;
 use super::shared::Shared;
+use super::{Admission, Topic};
 use crate::dds::participant::RawReader;
 use crate::dds::reader::StoppableThread;
-use crate::dds::{DdsError, EndpointId, Profile};
+use crate::dds::writer::endpoint_of;
+use crate::dds::{DdsError, EndpointId, Profile, Sample};
 use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
 
 /// Channels that one broker reads at most.
@@ -32,17 +33,53 @@ const SMALL_DEPTH: u16 = 1024;
 /// The same where they may be large.
 const LARGE_DEPTH: u16 = 32;
 
+/// How long a sample waits until it is known whether it is read.
+pub(super) const LONGEST_DOUBT: Duration = Duration::from_secs(3);
+/// Samples of a channel that wait for that, and their bytes; beyond that the oldest are lost.
+const MAX_DOUBTFUL: usize = 1024;
+const MAX_DOUBTFUL_BYTES: usize = 32 * 1024 * 1024;
+
+/// Samples of which it is not known yet whether they are read, in the order of their arrival.
+#[derive(Default)]
+pub(super) struct Doubtful {
+    samples: VecDeque<(Instant, Kind, Sample)>,
+    bytes: usize,
+}
+
+impl Doubtful {
+    /// Takes one. Returns how many gave way.
+    fn push(&mut self, now: Instant, kind: Kind, sample: Sample) -> u64 {
+        self.bytes += sample.sample.payload().len();
+        self.samples.push_back((now, kind, sample));
+        let mut lost = 0;
+        while self.samples.len() > MAX_DOUBTFUL || self.bytes > MAX_DOUBTFUL_BYTES {
+            lost += u64::from(self.pop().is_some());
+        }
+        lost
+    }
+
+    fn pop(&mut self) -> Option<(Instant, Kind, Sample)> {
+        let (since, kind, sample) = self.samples.pop_front()?;
+        self.bytes -= sample.sample.payload().len();
+        Some((since, kind, sample))
+    }
+
+    fn has(&self, writer: EndpointId) -> bool {
+        self.samples.iter().any(|(_, _, sample)| endpoint_of(sample.writer_guid) == writer)
+    }
+}
+
 /// The readers of a channel, and how far they have come.
 #[derive(Default)]
 pub(super) struct Readers {
-    pub(super) reliable: Option<RawReader>,
-    /// Where a best-effort writer is known: a reliable reader does not match it.
-    pub(super) best_effort: Option<RawReader>,
+    /// By [`Kind`]. A reader that asks for more than a writer offers does not match it.
+    pub(super) by_kind: [Option<RawReader>; 3],
     /// What came before is not delivered: RustDDS keeps samples of a topic for readers to come.
     pub(super) opened: Option<Timestamp>,
     /// What came of each writer.
     pub(super) seen: HashMap<EndpointId, Seen>,
     pub(super) history: History,
+    doubtful: Doubtful,
 }
 
 /// A channel that is read.
@@ -53,6 +90,8 @@ pub(super) struct Channel {
     pub(super) with_kept: bool,
     pub(super) senders: Mutex<Vec<SubscriptionSender>>,
     pub(super) readers: Mutex<Readers>,
+    /// Their identities, which others may ask for while they are read.
+    pub(super) ids: Mutex<[Option<EndpointId>; 3]>,
     /// Who waits until it is read.
     waiting: Mutex<Vec<oneshot::Sender<()>>>,
     /// It stands in the list of those with samples.
@@ -69,13 +108,23 @@ struct Ready {
 }
 
 impl Channel {
-    pub(super) fn profile(&self, reliable: bool) -> Profile {
+    pub(super) fn profile(&self, kind: Kind) -> Profile {
         let depth = if self.large { LARGE_DEPTH } else { SMALL_DEPTH };
         Profile {
-            reliable,
-            transient_local: self.with_kept && reliable,
+            reliable: kind != Kind::BestEffort,
+            transient_local: kind == Kind::Durable,
             terms: self.topic.terms,
             ..Profile::best_effort(depth)
+        }
+    }
+
+    /// Which readers it needs, where writers of these kinds are known; one stands in any case.
+    pub(super) fn wanted(&self, offered: [bool; 3], mixes: bool) -> [bool; 3] {
+        let [durable, reliable, best_effort] = offered;
+        if mixes && self.with_kept {
+            [durable, reliable || !(durable || best_effort), best_effort]
+        } else {
+            [self.with_kept, !self.with_kept, best_effort]
         }
     }
 
@@ -110,15 +159,16 @@ impl Channel {
     fn drain(&self, shared: &Shared) {
         self.is_ready.store(false, Ordering::Release);
         let mut readers = self.readers.lock();
-        let Readers { reliable, best_effort, opened, seen, history } = &mut *readers;
+        let Readers { by_kind, opened, seen, history, doubtful } = &mut *readers;
         let mut progress = Progress { opened: opened.unwrap_or(Timestamp::ZERO), seen, history };
+        self.resolve(shared, doubtful, &mut progress);
         let mut again = false;
-        for (reader, kind) in [(reliable, Kind::Reliable), (best_effort, Kind::BestEffort)] {
+        for (reader, kind) in by_kind.iter().zip(Kind::ALL) {
             let Some(reader) = reader else { continue };
-            again |= self.drain_one(shared, reader, kind, &mut progress);
+            again |= self.drain_one(shared, reader, kind, &mut progress, doubtful);
             reader.set_waker(Some(Waker::from(Arc::new(Bell(self.weak.clone())))));
             // What came before the waker was set woke nobody.
-            again |= self.drain_one(shared, reader, kind, &mut progress);
+            again |= self.drain_one(shared, reader, kind, &mut progress, doubtful);
         }
         let clock = |writer: EndpointId| {
             let facts = shared.writers.read().get(&writer).copied();
@@ -160,10 +210,36 @@ impl Channel {
         }
     }
 
-    /// Whether it holds messages that were kept, until their writers are quiet. Not to be waited
-    /// for while a reader is made.
-    fn holds_history(&self) -> bool {
-        self.readers.try_lock().is_some_and(|readers| !readers.history.is_empty())
+    /// Whether it holds messages: those that were kept until their writers are quiet, and those of
+    /// which it is not known yet whether they are read. Not to be waited for while a reader is made.
+    fn holds_messages(&self) -> bool {
+        let holds = |readers: &Readers| {
+            !(readers.history.is_empty() && readers.doubtful.samples.is_empty())
+        };
+        self.readers.try_lock().is_some_and(|readers| holds(&readers))
+    }
+
+    /// Delivers what waited until it is known whether it is read. The order of each writer stays.
+    fn resolve(&self, shared: &Shared, doubtful: &mut Doubtful, progress: &mut Progress<'_>) {
+        if doubtful.samples.is_empty() {
+            return;
+        }
+        let now = Instant::now();
+        let mut known: HashMap<EndpointId, Admission> = HashMap::new();
+        let mut rest = Doubtful::default();
+        while let Some((since, kind, sample)) = doubtful.pop() {
+            let writer = endpoint_of(sample.writer_guid);
+            let admission =
+                *known.entry(writer).or_insert_with(|| shared.dialect.admission(&writer));
+            match admission {
+                Admission::Yes => deliver(shared, self, kind, progress, &sample),
+                Admission::Later if now.saturating_duration_since(since) < LONGEST_DOUBT => {
+                    rest.push(since, kind, sample);
+                }
+                Admission::No | Admission::Later => {}
+            }
+        }
+        *doubtful = rest;
     }
 
     /// Returns whether there may be more.
@@ -173,11 +249,25 @@ impl Channel {
         reader: &RawReader,
         kind: Kind,
         progress: &mut Progress<'_>,
+        doubtful: &mut Doubtful,
     ) -> bool {
         reader.drain_read_notifications();
         for _ in 0..TURN {
             match reader.try_take_one() {
-                Ok(Some(sample)) => deliver(shared, self, kind, progress, &sample),
+                Ok(Some(sample)) => {
+                    let writer = endpoint_of(sample.writer_guid);
+                    let admission = match shared.dialect.admission(&writer) {
+                        Admission::Yes if doubtful.has(writer) => Admission::Later,
+                        admission => admission,
+                    };
+                    match admission {
+                        Admission::Yes => deliver(shared, self, kind, progress, &sample),
+                        Admission::Later => {
+                            self.note_lost(doubtful.push(Instant::now(), kind, sample));
+                        }
+                        Admission::No => {}
+                    }
+                }
                 Ok(None) => return false,
                 Err(error) => {
                     shared.counts.lock().malformed += 1;
@@ -248,6 +338,7 @@ impl Channels {
                 with_kept: options.with_kept,
                 senders: Mutex::default(),
                 readers: Mutex::default(),
+                ids: Mutex::default(),
                 waiting: Mutex::default(),
                 is_ready: AtomicBool::new(false),
                 ready,
@@ -260,7 +351,7 @@ impl Channels {
         // In this order, as the thread that opens it locks them.
         let readers = found.readers.lock();
         found.senders.lock().push(sender);
-        if readers.reliable.is_some() {
+        if readers.opened.is_some() {
             let _ = confirm.send(());
         } else {
             found.waiting.lock().push(confirm);
@@ -271,6 +362,21 @@ impl Channels {
 
     pub(super) fn list(&self) -> Vec<Arc<Channel>> {
         self.all.lock().values().map(Arc::clone).collect()
+    }
+
+    /// The identities of all readers.
+    pub(super) fn reader_ids(&self) -> Vec<EndpointId> {
+        let ids = |channel: Arc<Channel>| *channel.ids.lock();
+        let mut ids: Vec<EndpointId> = self.list().into_iter().flat_map(ids).flatten().collect();
+        ids.sort_unstable();
+        ids
+    }
+
+    /// All channels are looked at, though nothing came.
+    pub(super) fn look_again(&self) {
+        for channel in self.list() {
+            channel.note_samples();
+        }
     }
 
     /// Takes out the channels that nobody reads any more.
@@ -308,8 +414,9 @@ impl Channels {
     /// Takes out all readers, whose participant has died.
     pub(super) fn take_readers(&self) -> Vec<RawReader> {
         let take = |channel: Arc<Channel>| {
+            *channel.ids.lock() = [None; 3];
             let readers = std::mem::take(&mut *channel.readers.lock());
-            [readers.reliable, readers.best_effort]
+            readers.by_kind
         };
         self.list().into_iter().flat_map(take).flatten().collect()
     }
@@ -350,7 +457,7 @@ pub(super) fn start(shared: &Arc<Shared>, large: bool) -> Result<StoppableThread
             let of_this = |all: bool| {
                 let mut channels = shared.channels.list();
                 channels
-                    .retain(|channel| channel.large == large && (all || channel.holds_history()));
+                    .retain(|channel| channel.large == large && (all || channel.holds_messages()));
                 channels
             };
             if idle {

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use rustdds::Timestamp;
 
-use super::Decoded;
+use super::NoMessage;
 use super::channel::Channel;
 use super::kept::History;
 use super::seen::{Moment, Seen};
@@ -18,11 +18,26 @@ use crate::port::Received;
 /// Writers of one channel whose progress is remembered; those that are gone are forgotten first.
 const MAX_WRITERS: usize = 4096;
 
-/// Which of the two readers of a channel.
+/// Which reader of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
+    /// Begins with what writers keep, and is not given what others publish.
+    Durable,
     Reliable,
     BestEffort,
+}
+
+impl Kind {
+    pub(super) const ALL: [Self; 3] = [Self::Durable, Self::Reliable, Self::BestEffort];
+
+    /// The reader that is best for a writer.
+    pub(super) fn of(facts: WriterFacts, with_kept: bool) -> Self {
+        match facts.reliable {
+            true if facts.durable && with_kept => Self::Durable,
+            true => Self::Reliable,
+            false => Self::BestEffort,
+        }
+    }
 }
 
 /// How far the readers of a channel have come.
@@ -57,8 +72,8 @@ pub(super) fn deliver(
 ) {
     let writer = endpoint_of(sample.writer_guid());
     let facts = shared.writers.read().get(&writer).copied();
-    if kind == Kind::BestEffort && facts.is_some_and(|facts| facts.reliable) {
-        // The reliable reader has it, in order and complete.
+    if facts.is_some_and(|facts| Kind::of(facts, channel.with_kept) != kind) {
+        // Another reader has it, complete.
         return;
     }
     let opened = progress.opened;
@@ -83,9 +98,9 @@ pub(super) fn deliver(
         return;
     }
     let content = match shared.dialect.decode(&channel.topic, sample) {
-        Decoded::Message(content) => content,
-        Decoded::NotForUs => return,
-        Decoded::Malformed => {
+        Ok(content) => content,
+        Err(NoMessage::NotForUs) => return,
+        Err(NoMessage::Malformed) => {
             shared.counts.lock().malformed += 1;
             tracing::debug!(topic = &*channel.topic.name, "a sample is malformed");
             return;

@@ -160,7 +160,7 @@ impl Lifecycle {
         let writers = self.shared.slots.take_all();
         let readers = self.shared.channels.take_readers();
         self.shared.writers.write().clear();
-        self.shared.best_effort.write().clear();
+        self.shared.offered.write().clear();
         lay_aside((writers, readers, self.generation.take()), || {})
     }
 
@@ -214,8 +214,8 @@ fn make_missing(
         generation.fill(shared, slot, now)?;
     }
     for channel in shared.channels.list() {
-        let best_effort = shared.best_effort.read().contains(&*channel.topic.name);
-        generation.open(&channel, best_effort)?;
+        let offered = shared.offered.read().get(&*channel.topic.name).copied().unwrap_or_default();
+        generation.open(&channel, channel.wanted(offered, shared.dialect.mixes_durability()))?;
     }
     Ok(())
 }

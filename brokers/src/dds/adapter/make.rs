@@ -5,20 +5,22 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use parking_lot::{Mutex, RwLock};
+use parking_lot::Mutex;
 use rustdds::Timestamp;
 
 use super::Companion;
-use super::channel::Channel;
+use super::channel::{Channel, Readers};
+use super::deliver::Kind;
 use super::near::Near;
-use super::presence::{Clocks, Presence};
+use super::presence::Presence;
 use super::probe::Probe;
 use super::shared::{Shared, WriterFacts};
 use super::slot::Slot;
 use crate::dds::farewell::Farewell;
+use crate::dds::writer::endpoint_of;
 use crate::dds::{
-    DdsError, EndpointWatch, Endpoints, FoundEndpoint, GuidPrefix, Illness, Participant, Pulse,
-    create_error,
+    DdsError, EndpointId, EndpointWatch, Endpoints, FoundEndpoint, GuidPrefix, Illness,
+    Participant, Pulse, create_error,
 };
 
 /// Between two questions to the hosts of other participants.
@@ -90,20 +92,26 @@ impl Generation {
     }
 
     /// Makes the readers of a channel that are missing.
-    pub(super) fn open(&self, channel: &Channel, best_effort: bool) -> Result<(), DdsError> {
+    pub(super) fn open(&self, channel: &Channel, wanted: [bool; 3]) -> Result<(), DdsError> {
         let topic = (&*channel.topic.name, &*channel.topic.type_name);
         let mut readers = channel.readers.lock();
-        let is_new = readers.reliable.is_none();
-        if is_new {
-            // What is taken from now on is new, however long making the reader takes.
-            readers.opened = Some(Timestamp::now());
-            readers.reliable = Some(self.participant.raw_reader(topic, channel.profile(true))?);
+        let Readers { by_kind, opened, .. } = &mut *readers;
+        let mut is_new = false;
+        for ((reader, kind), wanted) in by_kind.iter_mut().zip(Kind::ALL).zip(wanted) {
+            if wanted && reader.is_none() {
+                is_new = true;
+                // What is taken from now on is new, however long making the reader takes.
+                let begin = Timestamp::now();
+                *reader = Some(self.participant.raw_reader(topic, channel.profile(kind))?);
+                opened.get_or_insert(begin);
+            }
         }
-        if best_effort && readers.best_effort.is_none() {
-            readers.best_effort = Some(self.participant.raw_reader(topic, channel.profile(false))?);
-        } else if !is_new {
+        if !is_new {
             return Ok(());
         }
+        *channel.ids.lock() = by_kind
+            .each_ref()
+            .map(|reader| reader.as_ref().map(|reader| endpoint_of(reader.guid())));
         drop(readers);
         channel.opened();
         Ok(())
@@ -112,7 +120,7 @@ impl Generation {
     /// What belongs to this life has its turn. Returns whether another participant has given this
     /// one up.
     pub(super) fn tick(&mut self, shared: &Shared, now: Instant) -> bool {
-        let others = Others { presence: &self.presence, clocks: &shared.clocks };
+        let others = Others { presence: &self.presence, shared };
         self.companion.tick(now, self.participant.prefix(), &others)
     }
 
@@ -163,7 +171,7 @@ impl Generation {
 /// Takes over what other participants have.
 fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
-    let mut best_effort = HashSet::new();
+    let mut offered: HashMap<String, [bool; 3]> = HashMap::new();
     shared.dialect.note_endpoints(endpoints);
     let signs = shared.dialect.sign_topic();
     let sign =
@@ -180,14 +188,12 @@ fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpo
                 signs: alive.contains(&writer.participant()),
             };
             writers.insert(writer.id, facts);
-            if !writer.is_reliable() {
-                best_effort.insert(writer.topic.clone());
-            }
+            offered.entry(writer.topic.clone()).or_default()[Kind::of(facts, true) as usize] = true;
         }
     }
-    let changed = *shared.best_effort.read() != best_effort;
+    let changed = *shared.offered.read() != offered;
     if changed {
-        *shared.best_effort.write() = best_effort;
+        *shared.offered.write() = offered;
         shared.wake_lifecycle();
     }
 }
@@ -195,7 +201,7 @@ fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpo
 /// What a companion knows of other participants, and tells of them.
 pub(crate) struct Others<'a> {
     presence: &'a Mutex<Presence>,
-    clocks: &'a RwLock<Clocks>,
+    shared: &'a Shared,
 }
 
 impl Others<'_> {
@@ -209,8 +215,22 @@ impl Others<'_> {
         self.presence.lock().sign(now, from);
     }
 
+    /// Readers and writers of topics that this participant has.
+    pub(crate) fn own_endpoints(&self) -> (Vec<EndpointId>, Vec<EndpointId>) {
+        let writers = self.shared.writers.read();
+        let own = writers.iter().filter(|(_, facts)| facts.own);
+        let mut writers: Vec<EndpointId> = own.map(|(id, _)| *id).collect();
+        writers.sort_unstable();
+        (self.shared.channels.reader_ids(), writers)
+    }
+
+    /// A sample was malformed.
+    pub(crate) fn note_malformed(&self) {
+        self.shared.counts.lock().malformed += 1;
+    }
+
     /// One has told its time of day; both times in nanoseconds since 1970.
     pub(crate) fn compare(&self, now: Instant, from: GuidPrefix, sent_ns: i128, received_ns: i128) {
-        self.clocks.write().compare(now, from, sent_ns, received_ns);
+        self.shared.clocks.write().compare(now, from, sent_ns, received_ns);
     }
 }

@@ -37,10 +37,13 @@ use tokio::sync::watch;
 
 use super::participant::Terms;
 use super::reader::StoppableThread;
-use super::{Cdr, DdsError, Endpoints, GuidPrefix, Participant, ParticipantConfig, Sample};
-use crate::outbox::{Admission, Body, LanePublisher};
+use super::{
+    Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Sample,
+};
+use crate::outbox::{Admission as OutboxAdmission, Body, LanePublisher};
 use crate::port::{
     BrokerError, BrokerStatus, Content, PublisherOptions, SubscribeOptions, Subscription,
+    SubscriptionSender,
 };
 use send::Target;
 use shared::Shared;
@@ -67,6 +70,8 @@ const LOOK: Duration = Duration::from_millis(5);
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) struct Topic {
     pub(crate) name: Arc<str>,
+    /// The topic as users name it.
+    pub(crate) user: Arc<str>,
     pub(crate) type_name: Arc<str>,
     pub(crate) terms: Terms,
 }
@@ -77,11 +82,18 @@ pub(crate) struct Encoded {
     pub(crate) options: WriteOptionsBuilder,
 }
 
-/// What a sample is to those who read its topic.
-pub(crate) enum Decoded {
-    Message(Content),
+/// Whether samples of a writer are read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Admission {
+    Yes,
+    No,
+    /// It is not known yet: they wait, at most [`channel::LONGEST_DOUBT`].
+    Later,
+}
+
+/// Why a sample is no message to those who read its topic.
+pub(crate) enum NoMessage {
     /// It is for other readers.
-    #[allow(dead_code, reason = "of the adapter of ROS 2")]
     NotForUs,
     Malformed,
 }
@@ -101,6 +113,11 @@ pub(crate) trait Dialect: Send + Sync + 'static {
         now: Instant,
     ) -> Result<Box<dyn Companion>, DdsError>;
 
+    /// Whether writers of one topic may keep samples for late joiners, and others not.
+    fn mixes_durability(&self) -> bool {
+        false
+    }
+
     /// The topic on which participants of this kind tell that they live.
     fn sign_topic(&self) -> Option<&'static str> {
         None
@@ -109,8 +126,16 @@ pub(crate) trait Dialect: Send + Sync + 'static {
     /// All readers and writers that others have.
     fn note_endpoints(&self, endpoints: &Endpoints);
 
+    /// Whether samples of a writer are read. It may not have been found yet.
+    fn admission(&self, _writer: &EndpointId) -> Admission {
+        Admission::Yes
+    }
+
     /// What a sample of another participant holds, or what an own writer keeps.
-    fn decode(&self, topic: &Topic, sample: &Sample) -> Decoded;
+    ///
+    /// # Errors
+    /// [`NoMessage`] where it is none.
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Content, NoMessage>;
 
     /// The sample of a message. `durable`: it is kept for late joiners.
     ///
@@ -182,7 +207,7 @@ impl Adapter {
     }
 
     /// Whether topics can be read and written now.
-    fn check_up(&self) -> Result<(), BrokerError> {
+    pub(crate) fn check_up(&self) -> Result<(), BrokerError> {
         self.check_open()?;
         if self.shared.is_up() { Ok(()) } else { Err(self.shared.away()) }
     }
@@ -202,6 +227,11 @@ impl Adapter {
             return Err(BrokerError::Closed);
         }
         Ok(())
+    }
+
+    /// Samples that wait because it was not known whether they are read are looked at again.
+    pub(crate) fn look_again(&self) {
+        self.shared.channels.look_again();
     }
 
     /// Writes a topic.
@@ -227,6 +257,19 @@ impl Adapter {
             lane: self.shared.outbox.lane(target, Some(longest_wait)),
             admission: Arc::clone(&self.shared),
         }
+    }
+
+    /// Reads a topic for somebody who reads others, too.
+    pub(crate) fn read(
+        &self,
+        topic: Topic,
+        sender: SubscriptionSender,
+        options: SubscribeOptions,
+    ) -> Result<(), BrokerError> {
+        // It is made by the lifecycle thread; nobody waits for that.
+        self.shared.channels.add(topic, sender, options)?;
+        self.shared.wake_lifecycle();
+        Ok(())
     }
 
     /// Reads a topic.
@@ -282,7 +325,7 @@ impl Drop for Adapter {
 /// Writes one topic.
 pub(crate) type TopicPublisher = LanePublisher<Target, Arc<Shared>>;
 
-impl Admission for Arc<Shared> {
+impl OutboxAdmission for Arc<Shared> {
     fn is_shut(&self) -> bool {
         self.is_down()
     }

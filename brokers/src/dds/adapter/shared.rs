@@ -1,6 +1,6 @@
 //! What the threads of one broker share.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::sync::OnceLock;
@@ -56,8 +56,8 @@ pub(crate) struct Shared {
     pub(super) channels: Channels,
     /// What the writers that are known offer, our own included.
     pub(super) writers: RwLock<HashMap<EndpointId, WriterFacts>>,
-    /// Topics with a best-effort writer of another participant.
-    pub(super) best_effort: RwLock<HashSet<String>>,
+    /// By topic: the kinds of writers that other participants have.
+    pub(super) offered: RwLock<HashMap<String, [bool; 3]>>,
     pub(super) clocks: RwLock<Clocks>,
     pub(super) counts: Mutex<DdsCounts>,
     pub(super) closing: AtomicBool,
@@ -80,7 +80,7 @@ impl Shared {
             slots: Slots::default(),
             channels: Channels::default(),
             writers: RwLock::default(),
-            best_effort: RwLock::default(),
+            offered: RwLock::default(),
             clocks: RwLock::default(),
             counts: Mutex::default(),
             closing: AtomicBool::new(false),

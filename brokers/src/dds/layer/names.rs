@@ -20,7 +20,8 @@ pub(super) fn topic(channel: &ChannelName) -> Topic {
     } else {
         Arc::from(format!("{USER_PREFIX}{channel}"))
     };
-    Topic { name, type_name: Arc::from(FRAME_TYPE), terms: Terms::default() }
+    let user = Arc::from(channel.as_str());
+    Topic { name, user, type_name: Arc::from(FRAME_TYPE), terms: Terms::default() }
 }
 
 #[cfg(test)]

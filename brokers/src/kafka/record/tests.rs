@@ -22,6 +22,8 @@ fn full_header() -> Header {
         traceparent: "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01".to_owned(),
         reliable: true,
         depth: 3,
+        related: Some((WriterId([0xCD; 16]), 9)),
+        to: "edge/robot-2".to_owned(),
         ..Header::new("imu/data", origin, WriterId([0xAB; 16]), 7, 1_700_000_000_000_000_001)
     }
 }
@@ -63,6 +65,9 @@ fn headers_are_as_the_contract_says() {
             "blaze-reliable=true",
             "blaze-depth=3",
             "blaze-type-hash=RIHS01_0",
+            "blaze-related-writer=cdcdcdcdcdcdcdcdcdcdcdcdcdcdcdcd",
+            "blaze-related-sequence=9",
+            "blaze-to=edge/robot-2",
             "traceparent=00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01",
         ]
     );
@@ -106,6 +111,8 @@ fn broken_headers_are_malformed() {
         ("blaze-priority", b"urgent"),
         ("blaze-reliable", b"yes"),
         ("blaze-hops", b"4294967296"),
+        ("blaze-related-writer", b"cdcd"),
+        ("blaze-related-sequence", b"-1"),
     ] {
         let found = read_pairs(&replaced(name, value), b"12345");
         assert!(
@@ -141,7 +148,8 @@ fn names() -> impl Strategy<Value = String> {
             "blaze-time",
             "blaze-encoding", "blaze-age-us", "blaze-hops", "blaze-lifespan-ms", "blaze-priority",
             "blaze-reliable",
-            "blaze-depth", "blaze-type-hash", "traceparent", "blaze-unknown",
+            "blaze-depth", "blaze-type-hash", "blaze-related-writer", "blaze-related-sequence",
+            "blaze-to", "traceparent", "blaze-unknown",
         ]).prop_map(str::to_owned),
         1 => ".*",
     ]

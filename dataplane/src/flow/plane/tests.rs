@@ -99,7 +99,7 @@ impl Pair {
             receiver: "cloud/cloud-1".parse().unwrap(),
         };
         let topic = connect(&robot, Scope::Node, to, &written);
-        connect(&cloud, Scope::Inter, Target::Layer, &written);
+        connect(&cloud, Scope::Inter, Target::Layer { json: false }, &written);
         for (plane, other) in [(&robot, "cloud/cloud-1"), (&cloud, "edge/robot-1")] {
             let flow = other.parse().unwrap();
             plane.transport_event(TransportEvent::Discovered(Endpoint { flow, epoch: 1 }));

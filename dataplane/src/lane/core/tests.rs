@@ -3,6 +3,7 @@
 mod allocation;
 mod compress_stage;
 mod load;
+mod ros2;
 mod succession;
 
 use std::collections::BTreeMap;
@@ -18,7 +19,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::lane::path::{BareInfo, TopicInfo};
-use crate::plan::{Bridge, LaneSpec, TopicPlan};
+use crate::plan::{Bridge, Form, LaneSpec, TopicPlan};
 use crate::testing::access;
 use crate::world::LayerScopeId;
 
@@ -226,8 +227,10 @@ fn bridge(from: Scope, to: Target) -> Bridge {
 
 #[test]
 fn a_message_of_this_node_goes_to_every_bridge_once() {
-    let mut bench =
-        Bench::new(vec![bridge(Scope::Node, Target::Layer), bridge(Scope::Node, to_cloud())]);
+    let mut bench = Bench::new(vec![
+        bridge(Scope::Node, Target::Layer { json: false }),
+        bridge(Scope::Node, to_cloud()),
+    ]);
     let one = Content::Frame(frame(1, 1, "robot-1", 0, 10));
     bench.take(Scope::Node, vec![one.clone(), one]);
     assert_eq!(bench.link.submitted.len(), 1);
@@ -272,8 +275,8 @@ fn a_foreign_message_does_not_silence_the_writer_whose_name_it_bears() {
 #[test]
 fn an_own_write_that_comes_back_is_an_echo() {
     let mut bench = Bench::new(vec![
-        bridge(Scope::Inter, Target::Layer),
-        bridge(Scope::Layer, Target::Node { bare: false }),
+        bridge(Scope::Inter, Target::Layer { json: false }),
+        bridge(Scope::Layer, Target::Node(Form::Framed)),
     ]);
     bench.deliver(from_fog(5, 0).with_hops_and_age(1, 900));
     let written = bench.out.frames.lock()[0].clone();
@@ -287,7 +290,7 @@ fn an_own_write_that_comes_back_is_an_echo() {
 /// sends again.
 #[test]
 fn what_comes_over_the_link_behind_newer_messages_is_dropped() {
-    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
+    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer { json: false })]);
     for sequence in [8, 9, 5, 6, 7, 8, 9, 10] {
         bench.deliver(from_fog(sequence, 0));
     }
@@ -303,7 +306,7 @@ fn what_comes_over_the_link_behind_newer_messages_is_dropped() {
 #[test]
 fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
     let bridges =
-        vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Node, Target::Node { bare: true })];
+        vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Node, Target::Node(Form::Bare))];
     let mut bench = Bench::new(Vec::new());
     let of_service = |service: &str| BareInfo {
         encoding: "application/json".into(),
@@ -333,7 +336,9 @@ fn refusing(origins: &[&str]) -> TopicInfo {
 
 #[test]
 fn what_the_rules_refuse_is_told_apart_by_scope_and_from_what_is_of_elsewhere() {
-    let bridges = || vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Inter, Target::Layer)];
+    let bridges = || {
+        vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Inter, Target::Layer { json: false })]
+    };
     let mut bench = Bench::new(bridges());
     bench.apply(bridges(), refusing(&["edge/robot-1/imu", "fog"]));
     let (denied, foreign) = (frame(1, 1, "robot-1", 0, 1), frame(2, 1, "edge-2", 0, 1));
@@ -367,11 +372,14 @@ fn what_is_kept_of_origins_that_may_not_publish_any_more_goes_nowhere() {
     for (info, copies) in [(TopicInfo::default(), 2), (refusing(&["fog"]), 1)] {
         let durable =
             |to| Bridge { lane: lane_with(|lane| lane.durable = true), ..bridge(Scope::Inter, to) };
-        let mut bench = Bench::new(vec![durable(Target::Layer)]);
+        let mut bench = Bench::new(vec![durable(Target::Layer { json: false })]);
         bench.core.deliver_waiting(bench.now, bench.topic, &mut bench.link);
         bench.deliver(from_fog(1, 1));
         assert_eq!(bench.out.frames.lock().len(), 1);
-        bench.apply(vec![durable(Target::Layer), durable(Target::Node { bare: false })], info);
+        bench.apply(
+            vec![durable(Target::Layer { json: false }), durable(Target::Node(Form::Framed))],
+            info,
+        );
         bench.core.deliver_waiting(bench.now, bench.topic, &mut bench.link);
         assert_eq!(bench.out.frames.lock().len(), copies);
     }
@@ -447,7 +455,7 @@ proptest! {
         let lane = LaneSpec { lifespan_ms: 100, max_rate_hz: Some(50.0), reliable, ..lane_spec() };
         let mut bench = Bench::new(vec![
             Bridge { from: Scope::Node, to: to_cloud(), lane: lane.clone() },
-            Bridge { from: Scope::Node, to: Target::Layer, lane },
+            Bridge { from: Scope::Node, to: Target::Layer { json: false }, lane },
         ]);
         bench.link.refuse = refuse;
         for (writer, sequence, here, age) in messages {
@@ -513,7 +521,7 @@ impl Publisher for Adapter {
 impl Bench {
     /// Applies one bridge from node to layer with this writer.
     fn write_with(&mut self, writer: Result<&Arc<Adapter>, &str>) {
-        let plan = planned(vec![bridge(Scope::Node, Target::Layer)]);
+        let plan = planned(vec![bridge(Scope::Node, Target::Layer { json: false })]);
         self.core.apply(self.now, self.topic, TopicInfo::default(), &plan, |_| {
             writer.map_err(str::to_owned).and_then(writes_to)
         });
@@ -593,7 +601,7 @@ fn a_bridge_that_ends_keeps_its_writer_until_all_is_delivered() {
     let ended = |bench: &Bench| bench.core.path(bench.topic).bridges[0].is_over();
     assert!(!ended(&bench) && Arc::strong_count(&adapter) == 2);
     let name: TopicName = "imu/data".parse().unwrap();
-    let held = bench.core.writer_of(&name, Scope::Node, &Target::Layer).cloned();
+    let held = bench.core.writer_of(&name, Scope::Node, &Target::Layer { json: false }).cloned();
     assert!(held.is_some(), "if it comes back it goes on with the same queue, in order");
     drop(held);
     adapter.settle(3, 1, 0);
@@ -631,7 +639,7 @@ fn a_bridge_without_a_writer_has_failed_and_reads_nothing() {
 #[test]
 fn bare_copies_are_made_of_what_comes_from_anywhere() {
     let bridges = [Scope::Node, Scope::Layer, Scope::Inter]
-        .map(|from| bridge(from, Target::Node { bare: true }));
+        .map(|from| bridge(from, Target::Node(Form::Bare)));
     let mut bench = Bench::new(bridges.into());
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
     bench.take(Scope::Layer, vec![Content::Frame(frame(2, 1, "edge-2", 1, 2))]);

@@ -8,11 +8,11 @@ use blaze_domain::{FlowId, LayerKind};
 use crate::plan::Survey;
 use crate::plan::told::{told_inside, told_outside};
 
-use super::worlds::{advertise, flow, request, topic};
+use super::worlds::{advertise, flow, network, request, topic};
 use crate::testing::Random;
 use crate::world::{
-    Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, Role, ScopeEntry, Source,
-    TopicEntry, World,
+    Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, Role, Ros2Network,
+    ScopeEntry, Source, TopicEntry, World,
 };
 
 const SERVICES: [&str; 3] = ["driver", "filter", "logger"];
@@ -39,9 +39,11 @@ impl System {
                 2 => &[Some(1), Some(1), None],
                 _ => &[Some(1), Some(2), None],
             };
+            let networks = System::networks(dice);
             for n in 0..1 + dice.index(4) {
                 let mut view = flow(*dice.pick(brokers));
                 view.kind = kind;
+                view.ros2 = System::network(dice, networks, view.layer_scope);
                 let name: FlowId = format!("layer-{l}/n{l}{n}").parse().unwrap();
                 flows.insert(name, view);
             }
@@ -58,8 +60,31 @@ impl System {
             system.reroll_flow(dice, &id);
             system.reroll_node(dice, &id);
             system.reroll_layer(dice, &id);
+            system.reroll_ros2(dice, &id);
         }
         system
+    }
+
+    /// ROS 2 networks of the flows of one layer: none, one, one for each flow, several.
+    fn networks(dice: &mut Random) -> &'static [Option<u64>] {
+        match dice.index(4) {
+            0 => &[None],
+            1 => &[Some(1)],
+            2 => &[Some(1), Some(2), Some(3), Some(4)],
+            _ => &[Some(1), Some(1), Some(2), None],
+        }
+    }
+
+    /// A network of flows that share a layer broker, or of those that have none: a service of a
+    /// layer may name the node of a flow that is not on its broker, and what comes from the inter
+    /// scope does not say where it was born.
+    fn network(
+        dice: &mut Random,
+        networks: &[Option<u64>],
+        broker: Option<LayerScopeId>,
+    ) -> Option<Ros2Network> {
+        let base = (*dice.pick(networks))?;
+        Some(network(base * 10 + broker.map_or(0, |broker| broker.0)))
     }
 
     /// One with a group of more than 16 flows, where some flows of each group are not on the inter
@@ -67,16 +92,22 @@ impl System {
     /// scopes as of one, they match more than they do.
     pub(crate) fn with_gateways(dice: &mut Random) -> Self {
         let mut system = Self::random(dice);
+        let networks = System::networks(dice);
         for n in 0..17 + dice.index(6) {
             let name: FlowId = format!("layer-9/n9{n}").parse().unwrap();
             system.nodes.push(name.node.to_string());
-            system.world.flows.insert(name, flow(Some(1)));
+            let mut view = flow(Some(1));
+            view.ros2 = System::network(dice, networks, view.layer_scope);
+            system.world.flows.insert(name, view);
         }
         for id in system.ids() {
             if id.layer.as_str() == "layer-9" {
                 system.reroll_flow(dice, &id);
                 if dice.percent(40) {
                     system.reroll_node(dice, &id);
+                }
+                if dice.percent(40) {
+                    system.reroll_ros2(dice, &id);
                 }
             }
         }
@@ -92,7 +123,7 @@ impl System {
 
     pub(crate) fn tell_precisely(&mut self) {
         let topics = self.world.flows.values_mut().flat_map(|view| view.topics.values_mut());
-        for entry in topics.flat_map(|entry| [&mut entry.node, &mut entry.layer]) {
+        for entry in topics.flat_map(|entry| [&mut entry.node, &mut entry.layer, &mut entry.ros2]) {
             entry.advertise.iter_mut().for_each(|offer| {
                 offer.type_name.clear();
                 offer.more_sources = false;
@@ -135,9 +166,10 @@ impl System {
     /// Something happens somewhere.
     pub(crate) fn change(&mut self, dice: &mut Random) {
         let id = dice.pick(&self.ids()).clone();
-        match dice.index(3) {
+        match dice.index(4) {
             0 => self.reroll_flow(dice, &id),
             1 => self.reroll_node(dice, &id),
+            2 => self.reroll_ros2(dice, &id),
             _ => self.reroll_layer(dice, &id),
         }
     }
@@ -164,7 +196,9 @@ impl System {
 
     /// Flows that share a broker know the same of it.
     fn reroll_layer(&mut self, dice: &mut Random, id: &FlowId) {
-        let entry = self.scope_entry(dice, None);
+        let mut entry = self.scope_entry(dice, None);
+        // There are no bare copies there.
+        entry.request.iter_mut().for_each(|ask| ask.framed |= ask.bare || !ask.json);
         let broker = self.world.flows[id].layer_scope;
         for other in self.ids() {
             let same = broker.is_some()
@@ -172,6 +206,21 @@ impl System {
                 && self.world.flows[&other].layer_scope == broker;
             if same || other == *id {
                 self.entry(&other).layer = entry.clone();
+            }
+        }
+    }
+
+    /// Each flow has writers of its own; those on one network know the same of its readers.
+    fn reroll_ros2(&mut self, dice: &mut Random, id: &FlowId) {
+        let ScopeEntry { advertise, request } = self.scope_entry(dice, Some(id.node.as_str()));
+        let request =
+            request.map(|request| Request { framed: true, bare: false, json: false, ..request });
+        let network = self.world.flows[id].ros2;
+        self.entry(id).ros2.advertise = advertise.filter(|_| network.is_some());
+        for other in self.ids() {
+            let same = other.layer == id.layer && self.world.flows[&other].ros2 == network;
+            if network.is_some() && same {
+                self.entry(&other).ros2.request.clone_from(&request);
             }
         }
     }
@@ -219,7 +268,14 @@ impl System {
             })
             .collect();
         let wish = dice.index(4);
-        Request { from, type_name: type_name(dice), framed: wish < 3, bare: wish > 1, ..request() }
+        Request {
+            from,
+            type_name: type_name(dice),
+            framed: wish < 3,
+            bare: wish > 1,
+            json: dice.percent(25),
+            ..request()
+        }
     }
 
     /// Who really publishes behind an advertisement: what it lists, and everybody that it may have

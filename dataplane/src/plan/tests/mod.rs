@@ -5,6 +5,7 @@ mod balance;
 pub(crate) mod generate;
 mod property;
 mod replicas;
+mod ros2;
 mod simulate;
 mod table;
 pub(crate) mod worlds;

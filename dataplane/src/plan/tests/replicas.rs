@@ -211,7 +211,7 @@ fn whoever_a_sender_has_chosen_takes_it_in_and_so_does_the_one_that_it_will_choo
     let best = receiver(&plan_of(&world, &robot, None));
     let other = FLOWS.map(id).into_iter().find(|flow| *flow != best).unwrap();
     let takes = |world: &World, flow: &FlowId| {
-        plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer)
+        plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer { json: false })
     };
     assert!(takes(&world, &best) && !takes(&world, &other));
     view(&mut world, &robot).parts.entry(topic()).or_default().receivers = vec![other.clone()];
@@ -248,7 +248,7 @@ fn of_more_receivers_than_a_sender_can_name_each_that_could_be_one_takes_it_in()
     let robot = id("e/r");
     let best = receiver(&plan_of(&world, &robot, None));
     let takes = |world: &World, flow: &FlowId| {
-        plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer)
+        plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer { json: false })
     };
     let others = || FLOWS.map(id).into_iter().filter(|flow| *flow != best);
     assert!(others().all(|flow| !takes(&world, &flow)));

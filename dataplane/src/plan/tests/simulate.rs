@@ -5,27 +5,38 @@
 //! reads back what it wrote drops it as an echo. Everything else that a flow or a scope sees twice
 //! is a fault here, although real flows drop repeats.
 
+mod needless;
+mod places;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use blaze_domain::{FlowId, Scope};
 
-use super::generate::{System, share_broker};
-use super::worlds::topic;
-use crate::plan::{LaneSpec, PlanRules, Target, TopicPlan, delivery};
-use crate::world::{Advertise, FlowState, FlowView, Reach, Request, ScopeEntry, Source};
+use places::{find_network, forms};
 
-/// Something that services attach to. A layer scope is named by the first flow that uses it.
+use super::generate::System;
+use super::worlds::topic;
+use crate::plan::{Form, LaneSpec, PlanRules, Target, TopicPlan, delivery};
+use crate::world::{FlowState, FlowView, Reach, Request, Source};
+
+/// Something that services attach to. A layer scope and a ROS 2 network are named by the first flow
+/// that uses it.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum Place {
-    Node(FlowId),
-    Bare(FlowId),
-    Layer(FlowId),
+    /// A node, in one of the forms that its services may ask for.
+    Node(FlowId, Form),
+    /// A layer scope, or its copies as JSON.
+    Layer(FlowId, bool),
+    /// A ROS 2 network.
+    Ros2(FlowId),
 }
 
 /// One message of one service.
 #[derive(Debug)]
 struct Message {
     born: Place,
+    /// The flow of its node, or that owns its writer; none of a service of a layer.
+    flow: Option<FlowId>,
     layer: String,
     source: Source,
     type_name: String,
@@ -40,6 +51,8 @@ struct Copy {
     writer: Option<FlowId>,
     hops: u32,
     crossed: bool,
+    /// It has just come over the inter scope.
+    on_link: bool,
     trail: Vec<BridgeKey>,
 }
 
@@ -57,6 +70,13 @@ pub(super) struct Simulation<'a> {
     plans: &'a BTreeMap<FlowId, TopicPlan>,
     intake: Intake,
     useful: BTreeSet<BridgeKey>,
+    /// The layer scopes and the ROS 2 networks that flows are on.
+    layers: BTreeMap<&'a FlowId, Place>,
+    networks: BTreeMap<&'a FlowId, Place>,
+    /// How flows treat what comes to them over the inter scope, as far as that was looked at.
+    intakes: BTreeMap<FlowId, Vec<(Target, LaneSpec)>>,
+    /// Who asks where.
+    requests: BTreeMap<Place, Vec<&'a Request>>,
     /// Messages that reached a requester over a bridge.
     pub(super) carried: usize,
     /// Messages that a gateway sent to another group for a flow that is not on the inter scope.
@@ -87,7 +107,29 @@ impl<'a> Simulation<'a> {
         plans: &'a BTreeMap<FlowId, TopicPlan>,
         intake: Intake,
     ) -> Self {
-        Self { system, plans, intake, useful: BTreeSet::new(), carried: 0, relayed: 0 }
+        let mut simulation = Self {
+            system,
+            plans,
+            intake,
+            useful: BTreeSet::new(),
+            layers: BTreeMap::new(),
+            networks: BTreeMap::new(),
+            intakes: BTreeMap::new(),
+            requests: BTreeMap::new(),
+            carried: 0,
+            relayed: 0,
+        };
+        for (id, view) in &system.world.flows {
+            simulation.layers.extend(simulation.find_layer(id).map(|layer| (id, layer)));
+            simulation.networks.extend(find_network(system, id, view).map(|network| (id, network)));
+        }
+        for (place, entry) in simulation.places() {
+            let Some(request) = &entry.request else { continue };
+            for form in forms(&place, request) {
+                simulation.requests.entry(form).or_default().push(request);
+            }
+        }
+        simulation
     }
 
     /// Sends one message of each service that publishes, then looks for bridges that did nothing.
@@ -109,71 +151,6 @@ impl<'a> Simulation<'a> {
         &self.system.world.flows[id]
     }
 
-    fn layer_of(&self, id: &FlowId) -> Option<Place> {
-        let scope = self.view(id).layer_scope;
-        scope?;
-        let mut sharing = self
-            .flows()
-            .filter(|(other, view)| share_broker((id, scope), (other, view.layer_scope)));
-        sharing.next().map(|(first, _)| Place::Layer(first.clone()))
-    }
-
-    /// All places with what their services say.
-    fn places(&self) -> Vec<(Place, &'a ScopeEntry)> {
-        let mut places = Vec::new();
-        for (id, view) in self.flows() {
-            let Some(entry) = view.topics.get(&topic()) else {
-                continue;
-            };
-            if view.node_scope {
-                places.push((Place::Node(id.clone()), &entry.node));
-            }
-            if self.layer_of(id) == Some(Place::Layer(id.clone())) {
-                places.push((Place::Layer(id.clone()), &entry.layer));
-            }
-        }
-        places
-    }
-
-    fn messages(&self) -> Vec<Message> {
-        let mut messages = Vec::new();
-        for (place, entry) in self.places() {
-            let Some(advertise) = &entry.advertise else { continue };
-            let (flow, node) = match &place {
-                Place::Node(flow) | Place::Bare(flow) => (flow, Some(flow.node.as_str())),
-                Place::Layer(flow) => (flow, None),
-            };
-            messages.extend(self.messages_of(&place, flow, node, advertise));
-        }
-        messages
-    }
-
-    fn messages_of(
-        &self,
-        place: &Place,
-        flow: &FlowId,
-        node: Option<&str>,
-        advertise: &Advertise,
-    ) -> Vec<Message> {
-        let message = |source| Message {
-            born: place.clone(),
-            layer: flow.layer.to_string(),
-            source,
-            type_name: advertise.type_name.clone(),
-        };
-        self.system.sources(advertise, node).into_iter().map(message).collect()
-    }
-
-    /// Flows that read a place.
-    fn readers(&self, place: &Place) -> Vec<&'a FlowId> {
-        let reads = |id: &FlowId| match place {
-            Place::Node(flow) => id == flow,
-            Place::Bare(_) => false,
-            Place::Layer(_) => self.layer_of(id).as_ref() == Some(place),
-        };
-        self.flows().filter(|(id, view)| is_live(view) && reads(id)).map(|(id, _)| id).collect()
-    }
-
     fn send(&mut self, message: &Message) -> Result<(), String> {
         let mut arrived: BTreeMap<Place, bool> = BTreeMap::new();
         let mut seen: BTreeSet<FlowId> = BTreeSet::new();
@@ -182,6 +159,7 @@ impl<'a> Simulation<'a> {
             writer: None,
             hops: 0,
             crossed: false,
+            on_link: false,
             trail: Vec::new(),
         }]);
         while let Some(copy) = queue.pop_front() {
@@ -189,7 +167,11 @@ impl<'a> Simulation<'a> {
                 return Err(format!("{:?} got it twice, last from {:?}", copy.place, copy.writer));
             }
             self.arrive(message, &copy)?;
-            for flow in self.readers(&copy.place) {
+            let readers = match copy.writer {
+                Some(_) => self.readers(&copy.place),
+                None => self.first_readers(message),
+            };
+            for flow in readers {
                 if copy.writer.as_ref() == Some(flow) {
                     continue;
                 }
@@ -223,7 +205,9 @@ impl<'a> Simulation<'a> {
         let scope = scope_of(&copy.place);
         let plans = self.plans;
         for bridge in plans[flow].bridges.iter().filter(|bridge| bridge.from == scope) {
-            if !carries(&bridge.lane, message) {
+            if !carries(&bridge.lane, message)
+                || !self.is_way(&bridge.to, &bridge.lane, message, copy)
+            {
                 continue;
             }
             let mut trail = copy.trail.clone();
@@ -257,10 +241,11 @@ impl<'a> Simulation<'a> {
                 writer: None,
                 hops: copy.hops + 1,
                 crossed: true,
+                on_link: true,
                 trail,
             };
             for (target, lane) in self.intake(receiver) {
-                if carries(&lane, message) {
+                if carries(&lane, message) && self.is_way(&target, &lane, message, &crossed) {
                     let mut trail = crossed.trail.clone();
                     trail.push((receiver.clone(), Scope::Inter, target.clone()));
                     queue.push_back(self.written(receiver, &target, &crossed, trail)?);
@@ -271,17 +256,39 @@ impl<'a> Simulation<'a> {
     }
 
     /// What a flow does with a message from the inter scope.
-    fn intake(&self, receiver: &FlowId) -> Vec<(Target, LaneSpec)> {
+    fn intake(&mut self, receiver: &FlowId) -> Vec<(Target, LaneSpec)> {
+        if let Some(known) = self.intakes.get(receiver) {
+            return known.clone();
+        }
+        let intake = self.find_intake(receiver);
+        self.intakes.insert(receiver.clone(), intake.clone());
+        intake
+    }
+
+    fn find_intake(&self, receiver: &FlowId) -> Vec<(Target, LaneSpec)> {
         let bridges = self.plans[receiver].bridges.iter();
         let bridges = bridges.filter(|bridge| bridge.from == Scope::Inter);
         if self.intake == Intake::Bridges {
             return bridges.map(|bridge| (bridge.to.clone(), bridge.lane.clone())).collect();
         }
-        let delivery = delivery(&self.system.known_to(receiver), &topic(), &PlanRules::default());
-        let framed = delivery.node_framed.map(|lane| (Target::Node { bare: false }, lane));
-        let bare = delivery.node_bare.map(|lane| (Target::Node { bare: true }, lane));
-        let layer = delivery.layer.map(|lane| (Target::Layer, lane));
-        framed.into_iter().chain(bare).chain(layer).collect()
+        delivery(&self.system.known_to(receiver), &topic(), &PlanRules::default())
+            .into_iter()
+            .collect()
+    }
+
+    /// What a flow looks at in each message: what other flows write or send is no matter of a
+    /// bridge if they wrote it where that one writes.
+    fn is_way(&self, to: &Target, lane: &LaneSpec, message: &Message, copy: &Copy) -> bool {
+        match to {
+            Target::Ros2 => {
+                let from = if copy.on_link { Scope::Inter } else { scope_of(&copy.place) };
+                !lane.natives.write(from, copy.hops, &message.layer, &message.source.node)
+            }
+            Target::Layer { json: true } => {
+                !matches!(copy.place, Place::Layer(..)) || copy.on_link || copy.hops == 0
+            }
+            Target::Layer { json: false } | Target::Node(_) | Target::Inter { .. } => true,
+        }
     }
 
     fn written(
@@ -292,13 +299,16 @@ impl<'a> Simulation<'a> {
         trail: Vec<BridgeKey>,
     ) -> Result<Copy, String> {
         let place = match target {
-            Target::Node { .. } if !self.view(flow).node_scope => {
+            Target::Node(_) if !self.view(flow).node_scope => {
                 return Err(format!("{flow} has no node scope"));
             }
-            Target::Node { bare: false } => Place::Node(flow.clone()),
-            Target::Node { bare: true } => Place::Bare(flow.clone()),
-            Target::Layer => {
-                self.layer_of(flow).ok_or_else(|| format!("{flow} has no layer scope"))?
+            Target::Node(form) => Place::Node(flow.clone(), *form),
+            Target::Layer { json } => match self.layer_of(flow) {
+                Some(Place::Layer(first, _)) => Place::Layer(first, *json),
+                _ => return Err(format!("{flow} has no layer scope")),
+            },
+            Target::Ros2 => {
+                self.network_of(flow).ok_or_else(|| format!("{flow} is on no ROS 2 network"))?
             }
             Target::Inter { .. } => return Err(format!("{flow} goes from inter to inter")),
         };
@@ -307,6 +317,7 @@ impl<'a> Simulation<'a> {
             writer: Some(flow.clone()),
             hops: copy.hops + 1,
             crossed: copy.crossed,
+            on_link: false,
             trail,
         })
     }
@@ -319,12 +330,12 @@ impl<'a> Simulation<'a> {
             self.carried += usize::from(!copy.trail.is_empty());
         }
         let mut asked = here;
-        if matches!(copy.place, Place::Layer(_)) {
+        if matches!(copy.place, Place::Layer(_, false)) {
             let readers = self
                 .readers(&copy.place)
                 .into_iter()
                 .filter(|flow| copy.writer.as_ref() != Some(flow));
-            asked.extend(readers.flat_map(|flow| self.node_requests(flow)));
+            asked.extend(readers.flat_map(|flow| self.requests_behind(flow, message)));
             // Who is not on the inter scope writes for other groups, too.
             let apart = |flow: &FlowId| !self.view(flow).role.is_inside();
             if copy.writer.as_ref().is_some_and(apart) {
@@ -341,58 +352,37 @@ impl<'a> Simulation<'a> {
         Ok(())
     }
 
+    /// What is asked for on the node of a flow, and on its network, if others are to write the
+    /// message there.
+    fn requests_behind(&self, flow: &FlowId, message: &Message) -> Vec<&'a Request> {
+        let mut requests = self.node_requests(flow);
+        let network = self.network_of(flow).filter(|network| {
+            !message.flow.as_ref().is_some_and(|origin| self.is_on(origin, network))
+        });
+        requests.extend(network.iter().flat_map(|network| self.requests_at(network)));
+        requests
+    }
+
     fn node_requests(&self, flow: &FlowId) -> Vec<&'a Request> {
-        let framed = self.requests_at(&Place::Node(flow.clone()));
-        framed.into_iter().chain(self.requests_at(&Place::Bare(flow.clone()))).collect()
+        let forms = Form::ALL.map(|form| self.requests_at(&Place::Node(flow.clone(), form)));
+        forms.concat()
     }
 
     fn requests_at(&self, place: &Place) -> Vec<&'a Request> {
-        let all = self.places();
-        let node = match place {
-            Place::Node(flow) | Place::Bare(flow) => Place::Node(flow.clone()),
-            Place::Layer(flow) => Place::Layer(flow.clone()),
-        };
-        let requests = all
-            .into_iter()
-            .filter(|(other, _)| *other == node)
-            .filter_map(|(_, entry)| entry.request.as_ref());
-        let fits = |request: &&Request| match place {
-            Place::Node(_) => request.framed,
-            Place::Bare(_) => request.bare,
-            Place::Layer(_) => true,
-        };
-        requests.filter(fits).collect()
+        self.requests.get(place).cloned().unwrap_or_default()
     }
 
-    /// Whether the message can leave the scope where it was born for the flow or the layer that
-    /// asks.
-    fn can_reach(&self, born: &Place, to: &Place) -> bool {
-        let (Place::Node(to_flow) | Place::Bare(to_flow) | Place::Layer(to_flow)) = to;
-        let live = |id: &FlowId| is_live(self.view(id));
-        let to_live = match to {
-            Place::Node(_) | Place::Bare(_) => live(to_flow),
-            Place::Layer(_) => !self.readers(to).is_empty(),
+    /// Whether the message can leave the scope where it was born for the place.
+    fn can_reach(&self, message: &Message, to: &Place) -> bool {
+        let share = |a: &FlowId, b: &FlowId| {
+            a == b || self.layer_of(a).is_some_and(|layer| self.layer_of(b) == Some(layer))
         };
-        let joined = |place: &Place| {
-            let (Place::Node(flow) | Place::Bare(flow) | Place::Layer(flow)) = place;
-            let layer = self.layer_of(flow);
-            let inside = |id: &FlowId| live(id) && self.view(id).role.is_inside();
-            let mut flows = self.flows().map(|(id, _)| id);
-            flows.any(|id| {
-                inside(id) && (id == flow || (layer.is_some() && self.layer_of(id) == layer))
-            })
-        };
-        let one_group = self.group_of(born) == self.group_of(to);
-        born == to
-            || (!self.readers(born).is_empty()
-                && to_live
-                && (one_group || (joined(born) && joined(to))))
-    }
-
-    /// The layer scope that a place belongs to, or the flow that has none.
-    fn group_of(&self, place: &Place) -> Place {
-        let (Place::Node(flow) | Place::Bare(flow) | Place::Layer(flow)) = place;
-        self.layer_of(flow).unwrap_or_else(|| Place::Node(flow.clone()))
+        let is_inside = |(_, view): &(&FlowId, &FlowView)| is_live(view) && view.role.is_inside();
+        let joined = |flow: &FlowId| self.flows().filter(is_inside).any(|(id, _)| share(id, flow));
+        let from = self.first_readers(message);
+        let to_flows = self.writers(to);
+        let mut pairs = from.iter().flat_map(|a| to_flows.iter().map(move |b| (*a, *b)));
+        message.born == *to || pairs.any(|(a, b)| share(a, b) || (joined(a) && joined(b)))
     }
 
     /// Every request that matches was served once.
@@ -406,90 +396,21 @@ impl<'a> Simulation<'a> {
             if !wants(request, message) {
                 continue;
             }
-            let targets = match &place {
-                Place::Node(flow) => {
-                    let framed = request.framed.then(|| place.clone());
-                    framed
-                        .into_iter()
-                        .chain(request.bare.then(|| Place::Bare(flow.clone())))
-                        .collect()
-                }
-                Place::Bare(_) | Place::Layer(_) => vec![place.clone()],
-            };
-            for target in targets {
-                if self.can_reach(&message.born, &target) && !arrived.contains_key(&target) {
+            for target in forms(&place, request) {
+                if self.can_reach(message, &target) && !arrived.contains_key(&target) {
                     return Err(format!("{target:?} did not get it"));
                 }
             }
         }
         Ok(())
     }
-
-    /// Every bridge carried something towards a requester, or waits beside an intake that a sender
-    /// could move away.
-    fn check_needless(&self) -> Result<(), String> {
-        for (flow, plan) in self.plans {
-            for bridge in &plan.bridges {
-                let key = (flow.clone(), bridge.from, bridge.to.clone());
-                if !self.useful.contains(&key) && !self.stands_by(flow, bridge.from, &bridge.to) {
-                    return Err(format!(
-                        "{flow} has a needless bridge {:?} to {:?}",
-                        bridge.from, bridge.to
-                    ));
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// A bridge from the layer to the node of a flow that takes the same from the inter scope,
-    /// while another flow of the layer asks for something of the same publishing scope too, so that
-    /// its sender may have chosen that one.
-    fn stands_by(&self, flow: &FlowId, from: Scope, to: &Target) -> bool {
-        if !self.view(flow).role.is_inside() && (from == Scope::Layer || *to == Target::Layer) {
-            // It is not told which origins there are outside.
-            return true;
-        }
-        let takes_it = self.useful.contains(&(flow.clone(), Scope::Inter, to.clone()));
-        let Some(layer) = self.layer_of(flow).filter(|_| from == Scope::Layer && takes_it) else {
-            return false;
-        };
-        let messages = self.messages();
-        let wanted = |requests: &[&Request], from: &Place| {
-            let mut sent = messages.iter().filter(|message| message.born == *from);
-            sent.any(|message| requests.iter().any(|request| wants(request, message)))
-        };
-        let shared = self.requests_at(&layer);
-        let (others, members): (Vec<_>, Vec<_>) = self
-            .readers(&layer)
-            .into_iter()
-            .filter(|other| *other != flow)
-            .partition(|other| self.view(other).role.is_inside());
-        let for_members =
-            |born: &Place| members.iter().any(|other| wanted(&self.node_requests(other), born));
-        messages.iter().map(|message| &message.born).any(|born| {
-            let outside = match born {
-                Place::Node(born) | Place::Bare(born) => {
-                    self.layer_of(born).as_ref() != Some(&layer)
-                }
-                Place::Layer(_) => *born != layer,
-            };
-            let could = |other: &FlowId| {
-                wanted(&shared, born)
-                    || wanted(&self.node_requests(other), born)
-                    || for_members(born)
-            };
-            let sent = outside && !self.readers(born).is_empty();
-            sent && wanted(&self.node_requests(flow), born)
-                && others.iter().any(|other| could(other))
-        })
-    }
 }
 
 fn scope_of(place: &Place) -> Scope {
     match place {
-        Place::Node(_) | Place::Bare(_) => Scope::Node,
-        Place::Layer(_) => Scope::Layer,
+        Place::Node(..) => Scope::Node,
+        Place::Layer(..) => Scope::Layer,
+        Place::Ros2(_) => Scope::Ros2,
     }
 }
 

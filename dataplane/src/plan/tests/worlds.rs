@@ -1,16 +1,17 @@
 //! Short ways to write a world.
 
 use std::collections::BTreeMap;
+use std::net::Ipv4Addr;
 
 use blaze_domain::node_file::AccessRules;
 use blaze_domain::{Durability, FlowId, LayerKind, Reliability, TopicName};
 use serde_json::{Value, json};
 
-use crate::plan::{Bridge, Target, TopicPlan};
+use crate::plan::{Bridge, Form, Target, TopicPlan};
 use crate::testing::access;
 use crate::world::{
     Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request,
-    Role, ScopeEntry, Source, TopicEntry, World,
+    Role, Ros2Network, Ros2NetworkId, ScopeEntry, Source, TopicEntry, World,
 };
 
 pub(crate) fn topic() -> TopicName {
@@ -53,7 +54,18 @@ pub(crate) fn request() -> Request {
         more_services: 0,
         framed: true,
         bare: false,
+        json: false,
     }
+}
+
+/// A request that is served as JSON alone.
+fn json_request() -> Request {
+    Request { framed: false, json: true, ..request() }
+}
+
+/// A ROS 2 network on loopback.
+pub(crate) fn network(id: u64) -> Ros2Network {
+    Ros2Network { id: Ros2NetworkId(id), address: Ipv4Addr::LOCALHOST }
 }
 
 /// The rules of a node file with this one for all topics: `{"request": {"deny": ["cloud"]}}`.
@@ -78,7 +90,8 @@ pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
 }
 
 /// A world written as one line per flow: `edge/a@1 node+ layer-`: `@1` is its layer broker, `+` an
-/// advertisement on that scope, `-` a request, `-b` a request for bare payloads; `down`, `suspect`,
+/// advertisement on that scope, `-` a request, `-b` a request for bare payloads, `-j` for JSON;
+/// `net1` its ROS 2 network; `down`, `suspect`,
 /// `starting`, `draining` and `settled` as they read; `away`: its layer broker does not answer it;
 /// `many`: it sends to more flows than it names; `carries` and `handed` say who carries the topic
 /// out of the layer, `>c/b` whom it is sent to. The first flow is `me`.
@@ -114,6 +127,13 @@ pub(crate) fn world(lines: &[&str]) -> World {
                 "layer+" => entry.layer.advertise = Some(advertise()),
                 "node-" => entry.node.request = Some(request()),
                 "layer-" => entry.layer.request = Some(request()),
+                "ros2+" => entry.ros2.advertise = Some(advertise()),
+                "ros2-" => entry.ros2.request = Some(request()),
+                "node-j" => entry.node.request = Some(json_request()),
+                "layer-j" => entry.layer.request = Some(json_request()),
+                word if word.starts_with("net") => {
+                    view.ros2 = Some(network(word[3..].parse().unwrap()));
+                }
                 "node-b" => {
                     entry.node.request = Some(Request { framed: false, bare: true, ..request() });
                 }
@@ -135,6 +155,7 @@ pub(crate) fn entry<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mu
     let entry = world.flows.get_mut(&id(flow)).unwrap().topics.entry(topic()).or_default();
     match scope {
         "node" => &mut entry.node,
+        "ros2" => &mut entry.ros2,
         _ => &mut entry.layer,
     }
 }
@@ -150,9 +171,12 @@ pub(crate) fn ask<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mut 
 /// `node>layer`, `inter>bare`, `node>cloud/c`: the bridges of a plan.
 pub(crate) fn ways(plan: &TopicPlan) -> Vec<String> {
     let way = |bridge: &Bridge| match &bridge.to {
-        Target::Node { bare: false } => format!("{}>node", bridge.from),
-        Target::Node { bare: true } => format!("{}>bare", bridge.from),
-        Target::Layer => format!("{}>layer", bridge.from),
+        Target::Node(Form::Framed) => format!("{}>node", bridge.from),
+        Target::Node(Form::Bare) => format!("{}>bare", bridge.from),
+        Target::Node(Form::Json) => format!("{}>json", bridge.from),
+        Target::Layer { json: false } => format!("{}>layer", bridge.from),
+        Target::Layer { json: true } => format!("{}>layer-json", bridge.from),
+        Target::Ros2 => format!("{}>ros2", bridge.from),
         Target::Inter { layer, receiver } => {
             assert_eq!(*layer, receiver.layer);
             format!("{}>{receiver}", bridge.from)

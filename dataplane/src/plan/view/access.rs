@@ -18,7 +18,7 @@ impl<'w> TopicView<'w> {
             return true;
         }
         let (layer, node) = match requester.scope {
-            Scope::Node => (flow.layer.as_str(), flow.node.as_str()),
+            Scope::Node | Scope::Ros2 => (flow.layer.as_str(), flow.node.as_str()),
             // All flows of the group hear these services, so whom of them the rules allow has a
             // lease here.
             Scope::Layer if requester.group == self.group => return self.leases_on_layer(),
@@ -124,7 +124,7 @@ impl<'w> TopicView<'w> {
             return false;
         }
         let may = |node: &str, service: &str| {
-            let node = if publisher.scope == Scope::Node { flow.node.as_str() } else { node };
+            let node = if publisher.is_of_flow() { flow.node.as_str() } else { node };
             self.access.allows(LeaseKind::Advertise, flow.layer.as_str(), node, service)
         };
         let sources = &advertise.sources;
@@ -140,7 +140,7 @@ impl<'w> TopicView<'w> {
         if publisher.group != self.group || publisher.scope == Scope::Inter {
             return false;
         }
-        if publisher.scope == Scope::Node && publisher.flow == self.me {
+        if publisher.is_of_flow() && publisher.flow == self.me {
             return true;
         }
         let is_relayed = || self.relayed_publishers().any(|relayed| relayed.flow == publisher.flow);
@@ -154,8 +154,8 @@ impl<'w> TopicView<'w> {
             return self.sends(publisher);
         }
         if publisher.group == self.group {
-            let own_node = publisher.flow == self.me && publisher.scope == Scope::Node;
-            return own_node && !meets_directly(publisher, requester);
+            let own = publisher.flow == self.me && publisher.is_of_flow();
+            return own && !meets_directly(publisher, requester);
         }
         // What is published on a layer scope is told by all flows of the layer, and one of them
         // sends it.
@@ -173,6 +173,7 @@ impl<'w> TopicView<'w> {
 fn place(flow: &FlowId, scope: Scope) -> String {
     match scope {
         Scope::Node => flow.to_string(),
+        Scope::Ros2 => format!("the ROS 2 network of {flow}"),
         Scope::Layer => format!("layer {}", flow.layer),
         Scope::Inter => "other layers".to_owned(),
     }

@@ -507,3 +507,38 @@ fn ten_thousand_leases_of_one_topic_are_taken() {
     assert_eq!(desk.wait(15_000).events.len(), 10_000);
     assert_eq!(desk.registry.lease_count(), 0);
 }
+
+#[test]
+fn a_request_says_in_which_forms_it_is_served() {
+    for (scope, bare, json, served) in [
+        (Scope::Node, false, false, (true, false, false)),
+        (Scope::Node, true, false, (false, true, false)),
+        (Scope::Node, false, true, (false, false, true)),
+        (Scope::Node, true, true, (false, true, true)),
+        // A layer scope has no bare copies: those get messages with a header.
+        (Scope::Layer, true, false, (true, true, false)),
+        (Scope::Layer, false, true, (false, false, true)),
+        (Scope::Layer, true, true, (true, true, true)),
+    ] {
+        let now = Instant::now();
+        let mut registry = Registry::new(config("edge/robot-1", 1, now));
+        let mut ask = lease("request", "odom", "a");
+        (ask["bare"], ask["json"]) = (bare.into(), json.into());
+        assert_eq!(say(&mut registry, now, scope, &ask).faults, 0);
+        let entry = &registry.world().own().unwrap().topics[&topic("odom")];
+        let entry = if scope == Scope::Node { &entry.node } else { &entry.layer };
+        let request = entry.request.as_ref().unwrap();
+        assert_eq!((request.framed, request.bare, request.json), served, "{scope} {bare} {json}");
+    }
+}
+
+#[test]
+fn a_call_is_answered_although_there_is_nobody_to_serve_it() {
+    let now = Instant::now();
+    let mut registry = Registry::new(config("edge/robot-1", 1, now));
+    let call = json!({"op": "call", "topic": "add_two_ints", "service": "planner", "id": "7",
+        "reply_to": "blaze/reply/planner", "request": {"a": 1}});
+    let outcome = say(&mut registry, now, Scope::Node, &call);
+    assert_eq!(outcome.answers[0].body["error"]["code"], "no_server");
+    assert_eq!((registry.lease_count(), outcome.changed.len()), (0, 0));
+}

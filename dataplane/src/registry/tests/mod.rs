@@ -1,6 +1,7 @@
 //! The registry as its owner drives it.
 
 mod control;
+mod found;
 mod gateways;
 mod replicas;
 mod stored;

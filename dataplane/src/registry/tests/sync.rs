@@ -44,9 +44,12 @@ impl Net {
             Body::Delta(_) => "delta",
             Body::SnapshotRequest(_) => "snapshot_request",
             Body::Snapshot(_) => "snapshot",
-            Body::Feedback(_) | Body::Goodbye(_) | Body::WrittenRequest(_) | Body::Written(_) => {
-                "other"
-            }
+            Body::Feedback(_)
+            | Body::Goodbye(_)
+            | Body::WrittenRequest(_)
+            | Body::Written(_)
+            | Body::TypeRequest(_)
+            | Body::TypeDefinition(_) => "other",
         };
         *self.sent.entry(name).or_default() += 1;
         let bytes = LinkControl::from(body).encode_to_vec();

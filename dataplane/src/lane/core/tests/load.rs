@@ -8,14 +8,16 @@ use crate::lane::load::{Loads, TopicLoad};
 const SECOND: Duration = Duration::from_secs(1);
 
 fn to_node() -> Target {
-    Target::Node { bare: false }
+    Target::Node(Form::Framed)
 }
 
 impl Bench {
     /// A bridge out of the layer, and one into it.
     fn of_layer() -> Self {
-        let mut bench =
-            Self::new(vec![bridge(Scope::Layer, to_cloud()), bridge(Scope::Inter, Target::Layer)]);
+        let mut bench = Self::new(vec![
+            bridge(Scope::Layer, to_cloud()),
+            bridge(Scope::Inter, Target::Layer { json: false }),
+        ]);
         bench.core.reads_from(bench.topic, &[0]);
         bench
     }
@@ -136,7 +138,7 @@ fn a_topic_that_is_given_up_is_emptied_when_its_last_message_has_left() {
 fn what_was_read_after_the_last_bridge_is_read_again() {
     let mut bench = Bench::of_layer();
     bench.publish_on_layer(0..5);
-    bench.apply(vec![bridge(Scope::Inter, Target::Layer)], TopicInfo::default());
+    bench.apply(vec![bridge(Scope::Inter, Target::Layer { json: false })], TopicInfo::default());
     let stopped = bench.core.stopped_at(bench.topic);
     bench.publish_on_layer(5..8);
     // The node's source ends, too: it has no places.

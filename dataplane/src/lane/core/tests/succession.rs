@@ -300,7 +300,7 @@ fn what_was_held_goes_on_where_there_is_never_room() {
 /// What others say of lanes and peers does not let a question be forgotten.
 #[test]
 fn a_question_is_answered_whatever_else_happens() {
-    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
+    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer { json: false })]);
     bench.deliver(of_cloud(1));
     bench.out.queued.store(1, Ordering::SeqCst);
     let Bench { core, link, now, .. } = &mut bench;
@@ -393,7 +393,7 @@ fn not_all_questions_are_asked_at_once() {
 
 #[test]
 fn a_question_is_answered_when_the_broker_has_what_had_come_by_then() {
-    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
+    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer { json: false })]);
     let asker: FlowId = "cloud/a".parse().unwrap();
     let answers = |bench: &mut Bench| std::mem::take(&mut bench.link.told);
     let ask = |bench: &mut Bench, topic: &str, token: u64| {
@@ -425,7 +425,7 @@ fn a_question_is_answered_when_the_broker_has_what_had_come_by_then() {
 
 #[test]
 fn questions_that_wait_are_bounded() {
-    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
+    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer { json: false })]);
     bench.deliver(of_cloud(1));
     bench.out.queued.store(1, Ordering::SeqCst);
     let ask = |bench: &mut Bench, asker: u64, topic: String, token: u64| {
@@ -448,7 +448,7 @@ fn questions_that_wait_are_bounded() {
     assert_eq!(answered(&mut bench), 1_024, "those beyond ask again");
     for number in 0..1_000 {
         let topic = format!("t/{number}");
-        bench.add(&topic, vec![bridge(Scope::Inter, Target::Layer)]);
+        bench.add(&topic, vec![bridge(Scope::Inter, Target::Layer { json: false })]);
         let origin = Origin { layer: "cloud".into(), ..Origin::default() };
         let header = Header::new(&topic, origin, WriterId([7; 16]), 1, WALL);
         let came = Frame::new(&header, Bytes::new()).unwrap();
@@ -473,7 +473,7 @@ fn what_waits_for_its_bridge_is_not_written() {
 /// A sender that has another receiver now may still have much on its way.
 #[test]
 fn a_bridge_from_the_link_that_drains_stays_while_messages_come() {
-    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
+    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer { json: false })]);
     bench.apply(vec![], TopicInfo::default());
     for sequence in 1..=100 {
         bench.pass(DRAIN / 2);

@@ -20,7 +20,7 @@ fn lying(sequence: u64, block: Bytes, announced: u64) -> Frame {
 }
 
 fn into_layer() -> Vec<Bridge> {
-    vec![bridge(Scope::Inter, Target::Layer)]
+    vec![bridge(Scope::Inter, Target::Layer { json: false })]
 }
 
 impl Hands {
@@ -144,7 +144,7 @@ fn without_a_pool_any_more_what_waits_is_dropped_and_the_rest_comes_behind_what_
 
 #[test]
 fn quick_turns_are_for_both_directions() {
-    let both = vec![lane("cloud/c", true), bridge(Scope::Inter, Target::Layer)];
+    let both = vec![lane("cloud/c", true), bridge(Scope::Inter, Target::Layer { json: false })];
     let mut hands = Hands::new(both);
     hands.publish_all(1, 1..=3, SMALL);
     for sequence in 1..=3 {

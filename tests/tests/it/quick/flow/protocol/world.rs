@@ -499,6 +499,7 @@ impl<'a> Simulation<'a> {
                 Output::Publish { .. }
                 | Output::LayerScope { .. }
                 | Output::LayerAway(_)
+                | Output::Ros2(_)
                 | Output::Replicas { .. }
                 | Output::Inter { .. }
                 | Output::SaveLease(_)
@@ -514,7 +515,7 @@ impl<'a> Simulation<'a> {
                     };
                     flow.plane.core.apply(now, id, *info, &plan, |bridge| {
                         let scope = match bridge.to {
-                            Target::Layer => Scope::Layer,
+                            Target::Layer { json: false } => Scope::Layer,
                             _ => Scope::Node,
                         };
                         let writer = ScopeWriter {

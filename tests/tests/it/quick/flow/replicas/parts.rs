@@ -204,6 +204,6 @@ pub(crate) struct Packet {
 pub(crate) fn channel(index: usize, scope: Scope, topic: &str) -> String {
     match scope {
         Scope::Layer => topic.to_owned(),
-        Scope::Node | Scope::Inter => format!("{index}/{topic}"),
+        Scope::Node | Scope::Ros2 | Scope::Inter => format!("{index}/{topic}"),
     }
 }

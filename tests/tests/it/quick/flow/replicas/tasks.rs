@@ -177,7 +177,7 @@ impl World {
                 return Ok(made);
             }
             let (server, scope) = match bridge.to {
-                Target::Layer => (kafka, Scope::Layer),
+                Target::Layer { json: false } => (kafka, Scope::Layer),
                 _ => (redis, Scope::Node),
             };
             let writer = server.writer(index, channel(index, scope, topic.as_str()), clock);

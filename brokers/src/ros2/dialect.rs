@@ -1,0 +1,251 @@
+//! Samples of a ROS 2 network: CDR of any type, identified as RTPS does.
+
+use std::net::Ipv4Addr;
+use std::sync::{Arc, OnceLock, Weak};
+use std::time::Instant;
+
+use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, WriterId};
+use blaze_proto::{Frame, Header};
+use rustdds::{Timestamp, WriteOptionsBuilder};
+
+use super::Inner;
+use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
+use super::names::{OWN_NAMESPACE, UNKNOWN_SERVICE, node_of_flow, service_of_node, type_of_dds};
+use super::network::Knowledge;
+use crate::dds::adapter::{
+    Admission, Companion, Dialect, Encoded, NoMessage, Others, Topic, nanos,
+};
+use crate::dds::participant::{RawReader, prefix_of};
+use crate::dds::{
+    Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
+    Relay, Sample, Terms, Writer,
+};
+use crate::outbox::Body;
+use crate::port::Content;
+
+/// Samples that a transient_local writer of ROS 2 keeps, as far as we know: discovery tells none.
+pub const KEPT_SAMPLES: u32 = 10;
+/// Room for what RustDDS sends at once; the system caps it (`net.core.wmem_max`).
+const SEND_BUFFER: usize = 8 * 1024 * 1024;
+/// Encapsulation and padding around the largest payload.
+const AROUND_PAYLOAD: usize = 16;
+/// Samples of the graph that wait to be read: each participant keeps one.
+const GRAPHS: u16 = 1024;
+/// RTPS: the entity that stands for the participant itself.
+const PARTICIPANT: [u8; 4] = [0x00, 0x00, 0x01, 0xc1];
+
+/// The dialect of ROS 2.
+pub(super) struct Ros {
+    pub(super) flow: FlowId,
+    pub(super) gid: GidLength,
+    pub(super) knowledge: Arc<Knowledge>,
+    /// Announces the participant to peers, and to those of this host that RustDDS leaves out.
+    pub(super) relay: Relay,
+    /// Who reads and writes topics; none while it is opened.
+    pub(super) user: Arc<OnceLock<Weak<Inner>>>,
+}
+
+impl Dialect for Ros {
+    fn participant(&self, domain: u16, address: Ipv4Addr) -> ParticipantConfig {
+        let largest = MAX_PAYLOAD_BYTES + AROUND_PAYLOAD;
+        ParticipantConfig {
+            send_buffer_bytes: SEND_BUFFER,
+            largest_sample: u32::try_from(largest).unwrap_or(u32::MAX),
+            repairs_fragments: true,
+            any_vendor: true,
+            ..ParticipantConfig::new(domain, address)
+        }
+    }
+
+    fn companion(
+        &self,
+        participant: &Participant,
+        _: Instant,
+    ) -> Result<Box<dyn Companion>, DdsError> {
+        self.relay.set_participant(participant.prefix());
+        let terms = Terms { marked: true, ..Terms::default() };
+        let keep = |depth| Profile {
+            reliable: true,
+            transient_local: true,
+            window: 64,
+            terms,
+            ..Profile::best_effort(depth)
+        };
+        Ok(Box::new(Graph {
+            reader: participant.raw_reader(GRAPH_TOPIC, keep(GRAPHS))?,
+            writer: participant.typed_writer(GRAPH_TOPIC, keep(1))?,
+            gid: self.gid,
+            node: node_of_flow(self.flow.layer.as_str(), self.flow.node.as_str()),
+            knowledge: Arc::clone(&self.knowledge),
+            told: None,
+        }))
+    }
+
+    fn mixes_durability(&self) -> bool {
+        true
+    }
+
+    fn note_endpoints(&self, endpoints: &Endpoints) {
+        self.knowledge.note_endpoints(Instant::now(), endpoints);
+        if let Some(user) = self.user.get().and_then(Weak::upgrade) {
+            user.follow();
+        }
+    }
+
+    fn admission(&self, writer: &EndpointId) -> Admission {
+        self.knowledge.admission(writer)
+    }
+
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Content, NoMessage> {
+        let id = sample.writer_guid.to_bytes();
+        let writer = self.knowledge.writer(&id).ok_or(NoMessage::NotForUs)?;
+        // RustDDS looks at names of topics alone.
+        if writer.dds_type != *topic.type_name {
+            return Err(NoMessage::NotForUs);
+        }
+        let type_name = writer.type_name.as_ref().ok_or(NoMessage::NotForUs)?;
+        let sequence =
+            u64::try_from(i64::from(sample.sequence_number)).map_err(|_| NoMessage::Malformed)?;
+        let written = sample.source_timestamp().map_or(0, nanos);
+        let service = match &writer.node {
+            Some(node) => service_of_node(node),
+            None => UNKNOWN_SERVICE.to_owned(),
+        };
+        let origin = Origin {
+            layer: self.flow.layer.to_string(),
+            node: self.flow.node.to_string(),
+            service,
+            instance: "0".to_owned(),
+            epoch: 0,
+        };
+        let header = Header {
+            encoding: format!("application/cdr; type={type_name}"),
+            type_hash: writer.type_hash.clone().unwrap_or_default(),
+            lifespan_ms: writer.lifespan.map_or(0, |lifespan| {
+                u32::try_from(lifespan.as_millis()).unwrap_or(u32::MAX).max(1)
+            }),
+            reliable: writer.reliable,
+            depth: if writer.durable { KEPT_SAMPLES } else { 0 },
+            age_us: age_us(written, nanos(Timestamp::now()), &writer.addresses),
+            ..Header::new(
+                &topic.user,
+                origin,
+                WriterId(id),
+                sequence,
+                u64::try_from(written).unwrap_or(0),
+            )
+        };
+        let frame = Frame::new(&header, sample.sample.payload().clone());
+        frame.map(Content::Frame).map_err(|_| NoMessage::Malformed)
+    }
+
+    fn encode(&self, topic: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
+        let Body::Frame(frame) = message else { return Err(DropReason::BrokerError) };
+        if let Some((_, told)) = frame.encoding().split_once("type=")
+            && type_of_dds(&topic.type_name).as_deref() != Some(told.trim())
+        {
+            return Err(DropReason::BrokerError);
+        }
+        let cdr = Cdr::little(frame.payload().clone()).ok_or(DropReason::BrokerError)?;
+        let mut options = WriteOptionsBuilder::new();
+        if let Some(written) = timestamp(frame.publish_time_ns()) {
+            options = options.source_timestamp(written);
+        }
+        Ok(Encoded { cdr, options })
+    }
+
+    /// What a flow writes to the network it does not read from there.
+    fn own(&self, _: &Topic, _: &Body) -> Option<Content> {
+        None
+    }
+}
+
+/// Age of a sample that was written just now, as far as clocks tell: those of this host are one.
+fn age_us(written_ns: i128, now_ns: i128, addresses: &[Ipv4Addr]) -> u64 {
+    let is_of_this_host = addresses.iter().any(Ipv4Addr::is_loopback);
+    if !is_of_this_host || written_ns == 0 {
+        return 0;
+    }
+    u64::try_from((now_ns - written_ns).max(0) / 1_000).unwrap_or(u64::MAX)
+}
+
+/// A time of day as RTPS has it; `None` where it is not known.
+fn timestamp(ns: u64) -> Option<Timestamp> {
+    let ticks = (u128::from(ns) << 32) / 1_000_000_000;
+    u64::try_from(ticks).ok().filter(|ticks| *ticks > 0).map(Timestamp::from_ticks)
+}
+
+/// Tells others which endpoints the flow's node has, and reads which nodes have which.
+struct Graph {
+    reader: RawReader,
+    writer: Writer,
+    gid: GidLength,
+    node: String,
+    knowledge: Arc<Knowledge>,
+    told: Option<ParticipantNodes>,
+}
+
+impl Companion for Graph {
+    fn tick(&mut self, now: Instant, own: GuidPrefix, others: &Others<'_>) -> bool {
+        self.tell(own, others);
+        self.reader.drain_read_notifications();
+        for _ in 0..GRAPHS {
+            let Ok(taken) = self.reader.try_take_one() else { continue };
+            let Some(sample) = taken else { break };
+            let from = prefix_of(sample.writer_guid);
+            match ParticipantNodes::read(&sample.sample) {
+                Some(told) if from != own && told.participant[..12] == from.0 => {
+                    self.knowledge.note_nodes(now, from, &told);
+                }
+                Some(_) => {}
+                None => others.note_malformed(),
+            }
+        }
+        self.knowledge.tick(now);
+        false
+    }
+}
+
+impl Graph {
+    /// Tells the own endpoints, if they are others than before.
+    fn tell(&mut self, own: GuidPrefix, others: &Others<'_>) {
+        let (readers, writers) = others.own_endpoints();
+        let node =
+            Node { namespace: OWN_NAMESPACE.to_owned(), name: self.node.clone(), readers, writers };
+        let mut participant = [0; 16];
+        participant[..12].copy_from_slice(&own.0);
+        participant[12..].copy_from_slice(&PARTICIPANT);
+        let nodes = ParticipantNodes { participant, nodes: vec![node] };
+        if self.told.as_ref() == Some(&nodes) {
+            return;
+        }
+        if let Some(cdr) = nodes.write(self.gid) {
+            self.writer.write_cdr(cdr, WriteOptionsBuilder::new());
+            self.told = Some(nodes);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ages_are_told_by_the_clock_of_this_host_alone() {
+        let here = [Ipv4Addr::LOCALHOST];
+        assert_eq!(age_us(5_000_000, 9_000_000, &here), 4_000);
+        assert_eq!(age_us(9_000_000, 5_000_000, &here), 0, "a clock may be set back");
+        assert_eq!(age_us(0, 5_000_000, &here), 0, "not told");
+        assert_eq!(age_us(5_000_000, 9_000_000, &[Ipv4Addr::new(10, 0, 0, 1)]), 0);
+    }
+
+    #[test]
+    fn times_of_day_survive() {
+        for ns in [1_000_000_000, 1_764_000_000_123_456_789] {
+            let back = nanos(timestamp(ns).unwrap());
+            assert!((i128::from(ns) - back).abs() <= 1, "{ns} {back}");
+        }
+        assert_eq!(timestamp(0), None);
+        assert_eq!(timestamp(u64::MAX), None, "beyond 2106");
+    }
+}

@@ -1,0 +1,273 @@
+//! A ROS 2 network as a broker: what its nodes publish is read as it is, and what other brokers
+//! publish is written as if a node had.
+//!
+//! ```text
+//! discovery, ros_discovery_info ─► Knowledge ─► Network: endpoints with type, QoS and node
+//! subscribe(topic) ─► a DDS reader per type of owned writers ─► samples ─► frames
+//! publisher(topic) ─► a DDS writer per type, in the node `/blaze/<layer>_<node>`
+//! ```
+//!
+//! Readers and writers of flows are marked, and never bridged. RustDDS matches by topic name alone,
+//! so types are checked here, by writer. What is read and offered follows the endpoints that come
+//! and go.
+
+mod dialect;
+mod endpoint;
+mod graph;
+pub mod names;
+mod network;
+mod offers;
+
+use std::collections::{BTreeSet, HashMap};
+use std::net::{IpAddr, Ipv4Addr};
+use std::sync::{Arc, OnceLock, Weak};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use blaze_domain::names::ChannelName;
+use blaze_domain::{FlowId, TopicName};
+use parking_lot::Mutex;
+use tokio::sync::watch;
+
+use crate::dds::adapter::{Adapter, Topic, TopicPublisher};
+use crate::dds::layer::DdsCounts;
+use crate::dds::{DdsError, EndpointId, Relay, RelayConfig, SLOTS, Terms};
+use crate::port::{
+    Broker, BrokerError, BrokerKind, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions,
+    Subscription, SubscriptionSender,
+};
+use dialect::Ros;
+use names::{RosName, type_to_dds};
+use network::Knowledge;
+use offers::{Offer, Offered};
+
+pub use dialect::KEPT_SAMPLES;
+pub use endpoint::{RosEndpoint, Vendor};
+pub use graph::GidLength;
+pub use network::{MAX_ENDPOINTS, Network};
+
+/// Where a flow meets ROS 2.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Ros2Config {
+    /// The flow, whose node is `/blaze/<layer>_<node>`.
+    pub flow: FlowId,
+    /// `ROS_DOMAIN_ID`.
+    pub domain: u16,
+    /// Address of the one interface; loopback: the ROS 2 nodes of this host.
+    pub interface: Ipv4Addr,
+    /// Stands before ROS 2 names in topics; may be empty.
+    pub namespace: String,
+    /// Hosts that multicast does not reach.
+    pub peers: Vec<Ipv4Addr>,
+    /// Length of gids in the graph.
+    pub gid: GidLength,
+}
+
+/// Participants of one peer that are announced to, as other implementations do.
+const PEER_SLOTS: u16 = 32;
+/// Time between two announcements to the same participant.
+const ANNOUNCE: Duration = Duration::from_secs(2);
+/// Topics that are read or written at once, each.
+const MAX_TOPICS: usize = 4096;
+
+/// A participant of a ROS 2 network.
+pub struct Ros2Broker {
+    inner: Arc<Inner>,
+}
+
+/// What the broker shares with its publishers, and with the thread that watches endpoints.
+struct Inner {
+    adapter: Adapter,
+    knowledge: Arc<Knowledge>,
+    namespace: String,
+    offers: Mutex<Vec<Weak<Offer>>>,
+    reads: Mutex<Vec<Read>>,
+}
+
+/// A topic that the flow reads.
+struct Read {
+    topic: TopicName,
+    name: RosName,
+    sender: SubscriptionSender,
+    options: SubscribeOptions,
+    /// DDS types that it is read in.
+    types: BTreeSet<String>,
+}
+
+impl Ros2Broker {
+    /// Starts in the background: the status tells how far it is. An interface that is missing is no
+    /// error: it is looked for each second.
+    ///
+    /// # Errors
+    /// [`DdsError`] where it can never work, or there is no thread for it.
+    pub fn open(config: Ros2Config) -> Result<Self, DdsError> {
+        crate::dds::check(config.domain, IpAddr::V4(config.interface))?;
+        let knowledge = Arc::new(Knowledge::new());
+        let relay = Relay::start(RelayConfig {
+            domain: config.domain,
+            address: config.interface,
+            peers: config.peers.iter().map(Ipv4Addr::to_string).collect(),
+            slots: PEER_SLOTS,
+            own_slots: SLOTS,
+            holds_multicast: false,
+            repeat: ANNOUNCE,
+        })?;
+        let user = Arc::<OnceLock<Weak<Inner>>>::default();
+        let ros = Ros {
+            flow: config.flow,
+            gid: config.gid,
+            knowledge: Arc::clone(&knowledge),
+            relay,
+            user: Arc::clone(&user),
+        };
+        let adapter = Adapter::open(Arc::new(ros), config.domain, config.interface)?;
+        let inner = Arc::new(Inner {
+            adapter,
+            knowledge,
+            namespace: config.namespace,
+            offers: Mutex::default(),
+            reads: Mutex::default(),
+        });
+        let _ = user.set(Arc::downgrade(&inner));
+        Ok(Self { inner })
+    }
+
+    /// The endpoints of ROS 2 nodes, and their changes.
+    #[must_use]
+    pub fn network(&self) -> watch::Receiver<Arc<Network>> {
+        self.inner.knowledge.subscribe()
+    }
+
+    /// What it has counted.
+    #[must_use]
+    pub fn counts(&self) -> DdsCounts {
+        self.inner.adapter.counts()
+    }
+
+    /// Which writers this flow takes messages of (`true`), and which others do. Messages of those
+    /// that are not named wait for a moment, since discovery may be ahead of the decision.
+    pub fn set_owned(&self, owned: HashMap<EndpointId, bool>) {
+        self.inner.knowledge.set_owned(owned);
+        self.inner.adapter.look_again();
+    }
+}
+
+#[async_trait]
+impl Broker for Ros2Broker {
+    fn kind(&self) -> BrokerKind {
+        BrokerKind::Ros2
+    }
+
+    fn status(&self) -> watch::Receiver<BrokerStatus> {
+        self.inner.adapter.status()
+    }
+
+    /// Writes a topic. Messages say their type in `encoding`; others are dropped, and so are those
+    /// that are no little-endian CDR.
+    fn publisher(
+        &self,
+        channel: &ChannelName,
+        options: PublisherOptions,
+    ) -> Result<Arc<dyn Publisher>, BrokerError> {
+        let (topic, name) = self.inner.name(channel)?;
+        let mut offers = self.inner.offers.lock();
+        offers.retain(|offer| offer.strong_count() > 0);
+        if offers.len() >= MAX_TOPICS {
+            return Err(BrokerError::TooManyChannels(MAX_TOPICS));
+        }
+        let offer = Arc::new(Offer::new(topic, name, options, Arc::downgrade(&self.inner)));
+        offers.push(Arc::downgrade(&offer));
+        Ok(offer)
+    }
+
+    /// Reads what the owned writers of a topic publish, as frames; also of writers that come later.
+    async fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
+        self.inner.adapter.check_up()?;
+        let (topic, name) = self.inner.name(channel)?;
+        let (sender, subscription) = crate::port::subscription(options);
+        let mut reads = self.inner.reads.lock();
+        if reads.len() >= MAX_TOPICS {
+            return Err(BrokerError::TooManyChannels(MAX_TOPICS));
+        }
+        let mut read = Read { topic, name, sender, options, types: BTreeSet::new() };
+        read.follow(&self.inner);
+        reads.push(read);
+        Ok(subscription)
+    }
+
+    async fn close(&self) {
+        self.inner.adapter.close().await;
+    }
+}
+
+impl Inner {
+    /// Readers and writers follow the endpoints of others.
+    fn follow(&self) {
+        let offers: Vec<Arc<Offer>> = self.offers.lock().iter().filter_map(Weak::upgrade).collect();
+        offers.iter().for_each(|offer| offer.follow(self));
+        self.reads.lock().retain_mut(|read| {
+            read.follow(self);
+            !read.sender.is_closed()
+        });
+    }
+
+    fn name(&self, channel: &ChannelName) -> Result<(TopicName, RosName), BrokerError> {
+        let refused = |reason: String| BrokerError::Name { channel: channel.to_string(), reason };
+        let topic: TopicName =
+            channel.as_str().parse().map_err(|error| refused(format!("it {error}")))?;
+        let name = RosName::of_topic(&topic, &self.namespace)
+            .map_err(|error| refused(error.to_string()))?;
+        Ok((topic, name))
+    }
+
+    /// What a writer is to offer, so that all readers of a topic and type are served.
+    fn offered(&self, name: &RosName, type_name: &str, published_reliable: bool) -> Offered {
+        let readers = self.knowledge.endpoints(name, false);
+        let of_type = readers.iter().filter(|it| it.type_name.as_deref() == Some(type_name));
+        Offered::to(published_reliable, of_type.map(Arc::as_ref))
+    }
+
+    /// A DDS writer; `None` where ROS 2 can have no such type, or the broker is closed.
+    fn writer(
+        &self,
+        name: &RosName,
+        topic: &TopicName,
+        type_name: &str,
+        terms: Terms,
+        options: PublisherOptions,
+    ) -> Option<TopicPublisher> {
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, terms);
+        self.adapter.publisher(topic, options).ok()
+    }
+}
+
+impl Read {
+    /// Makes readers for types that writers have now.
+    fn follow(&mut self, inner: &Inner) {
+        for writer in inner.knowledge.endpoints(&self.name, true) {
+            let is_readable = writer.type_name.is_some() && !writer.is_keyed;
+            if !is_readable || self.types.contains(&writer.dds_type) {
+                continue;
+            }
+            let terms = Terms { marked: true, ..Terms::default() };
+            let topic = dds_topic(&self.name, &self.topic, &writer.dds_type, terms);
+            match inner.adapter.read(topic, self.sender.clone(), self.options) {
+                Ok(()) => _ = self.types.insert(writer.dds_type.clone()),
+                Err(error) => tracing::warn!(topic = %self.topic, %error, "not read"),
+            }
+        }
+    }
+}
+
+fn dds_topic(name: &RosName, topic: &TopicName, dds_type: &str, terms: Terms) -> Topic {
+    Topic {
+        name: name.to_dds().into(),
+        user: topic.as_str().into(),
+        type_name: dds_type.into(),
+        terms,
+    }
+}

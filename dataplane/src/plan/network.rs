@@ -1,0 +1,229 @@
+//! ROS 2 networks: which flow owns a writer there, which one writes a message there, and which
+//! layer a network belongs to.
+//!
+//! ```text
+//! writers ──► one flow owns each: it reads it, and announces it as a service of its own
+//! readers ◄── one flow writes a message: that of its origin if it is on the network, else the one
+//!             that hashing chooses for the topic
+//! ```
+//!
+//! Between endpoints of one network there is no bridge. To the flow that writes for it, a network
+//! is like a node scope: a message from elsewhere comes to it over the layer broker or the inter
+//! scope.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::Ipv4Addr;
+
+use blaze_domain::{FlowId, LayerName, Scope, TopicName, WriterId};
+
+use super::rendezvous;
+use crate::world::{FlowView, Reach, Ros2Network, Ros2NetworkId, World};
+
+/// The flows of a layer on one ROS 2 network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct Network<'w> {
+    layer: &'w LayerName,
+    id: Ros2NetworkId,
+}
+
+impl<'w> Network<'w> {
+    /// The network that a flow is on.
+    pub(crate) fn of(id: &'w FlowId, flow: &FlowView) -> Option<Self> {
+        flow.ros2.map(|network| Self { layer: &id.layer, id: network.id })
+    }
+}
+
+/// Flows on a network, sorted. What was born on their nodes, or on the network, they write there
+/// themselves, so that the flow that writes the rest leaves it out. A service of the layer scope
+/// may name any node of its layer: what counts is the way that a message has come.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Natives {
+    /// Those that share the layer broker.
+    pub here: Vec<FlowId>,
+    /// The others.
+    pub elsewhere: Vec<FlowId>,
+}
+
+impl Natives {
+    /// Whether one of them writes a message to the network that came from this scope after so many
+    /// hops, with this layer and node as its origin.
+    #[must_use]
+    pub fn write(&self, from: Scope, hops: u32, layer: &str, node: &str) -> bool {
+        match (from, hops) {
+            (Scope::Layer, 0) => false,
+            (Scope::Layer, 1) => holds(&self.here, layer, node),
+            _ => holds(&self.elsewhere, layer, node),
+        }
+    }
+}
+
+/// Whether sorted flows hold that of a node.
+pub(super) fn holds(flows: &[FlowId], layer: &str, node: &str) -> bool {
+    let order = |flow: &FlowId| (flow.layer.as_str(), flow.node.as_str()).cmp(&(layer, node));
+    flows.binary_search_by(order).is_ok()
+}
+
+/// The networks of a world, each with its flows that carry topics.
+pub(crate) type Networks<'w> = BTreeMap<Network<'w>, Vec<&'w FlowId>>;
+
+/// The networks of a world.
+pub(crate) fn networks(world: &World) -> Networks<'_> {
+    let mut networks = Networks::new();
+    for (id, flow) in &world.flows {
+        if let Some(network) = Network::of(id, flow).filter(|_| world.carries(id)) {
+            networks.entry(network).or_default().push(id);
+        }
+    }
+    networks
+}
+
+/// The flow that writes messages of a topic to a network whose origin is on none of its flows.
+pub(crate) fn writer<'w>(
+    networks: &Networks<'w>,
+    network: Network<'w>,
+    topic: &TopicName,
+) -> Option<&'w FlowId> {
+    rendezvous::choose(topic.as_str(), networks.get(&network)?.iter().copied())
+}
+
+/// Whether messages of the topic are requests to a service or replies of one: they are written by
+/// the flow that they name.
+#[must_use]
+pub fn is_of_service(topic: &TopicName) -> bool {
+    topic.as_str().rsplit('/').next().is_some_and(|last| matches!(last, "_request" | "_reply"))
+}
+
+/// A flow that could own a writer of its network.
+pub type Candidate = (FlowId, Ipv4Addr);
+
+/// The flows on the network of the own flow that could own a writer there.
+#[must_use]
+pub fn candidates(world: &World) -> Vec<Candidate> {
+    let here = world.flows.get_key_value(&world.me).and_then(|(id, own)| Network::of(id, own));
+    let able = |(id, flow): (&FlowId, &FlowView)| {
+        let same = here.is_some() && Network::of(id, flow) == here;
+        (same && world.carries(id)).then_some((id.clone(), flow.ros2?.address))
+    };
+    world.flows.iter().filter_map(able).collect()
+}
+
+/// The flow that owns a writer because it has one of the writer's addresses; of several, as on
+/// loopback, the one that hashing chooses for the writer.
+#[must_use]
+pub fn claimant<'c>(
+    candidates: &'c [Candidate],
+    locators: &[Ipv4Addr],
+    guid: WriterId,
+) -> Option<&'c FlowId> {
+    let claims = candidates.iter().filter(|(_, address)| locators.contains(address));
+    rendezvous::choose(&guid.to_string(), claims.map(|(flow, _)| flow))
+}
+
+/// The flow that owns a writer which nobody has claimed for some time.
+#[must_use]
+pub fn heir(candidates: &[Candidate], guid: WriterId) -> Option<&FlowId> {
+    rendezvous::choose(&guid.to_string(), candidates.iter().map(|(flow, _)| flow))
+}
+
+/// The flow of another layer that the own flow has to leave its network to, if any: one with a
+/// smaller epoch, or the same and a smaller name. `network`: where the own flow would be. `found`:
+/// flows whose participants were found on it.
+#[must_use]
+pub fn holder<'w>(
+    world: &'w World,
+    network: Ros2Network,
+    found: &BTreeSet<FlowId>,
+) -> Option<&'w FlowId> {
+    let own = world.own()?;
+    let is_there = |id: &FlowId, flow: &FlowView| {
+        flow.ros2.is_some_and(|other| other.id == network.id || found.contains(id))
+    };
+    let mut others = world.flows.iter().filter(|(id, flow)| {
+        id.layer != world.me.layer && flow.reach != Reach::Down && is_there(id, flow)
+    });
+    let precedes = |(id, flow): &(&FlowId, &FlowView)| (flow.epoch, *id) < (own.epoch, &world.me);
+    others.find(precedes).map(|(id, _)| id)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::tests::worlds::{id, network, topic, world};
+
+    fn guid(n: u8) -> WriterId {
+        WriterId([n; 16])
+    }
+
+    #[test]
+    fn a_writer_belongs_to_the_flow_that_has_one_of_its_addresses() {
+        let mut world = world(&["e/a net1", "e/b net1", "e/c net2", "f/d net1", "e/e net1 down"]);
+        let at = |n: u8| Ipv4Addr::new(10, 0, 0, n);
+        for (n, view) in (1..).zip(world.flows.values_mut()) {
+            view.ros2.as_mut().unwrap().address = at(n);
+        }
+        let all = candidates(&world);
+        assert_eq!(all, [(id("e/a"), at(1)), (id("e/b"), at(2))], "of one layer, alive");
+        assert_eq!(claimant(&all, &[at(9), at(2)], guid(1)), Some(&id("e/b")));
+        assert_eq!(claimant(&all, &[at(9)], guid(1)), None);
+        world.me = id("f/d");
+        assert_eq!(candidates(&world).len(), 1);
+    }
+
+    #[test]
+    fn of_several_that_could_own_a_writer_hashing_chooses_one() {
+        let flows = ["e/a net1", "e/b net1", "e/c net1"];
+        let all = candidates(&world(&flows));
+        let mut owned = BTreeMap::new();
+        for n in 0..90 {
+            let owner = claimant(&all, &[Ipv4Addr::LOCALHOST], guid(n)).unwrap();
+            assert_eq!(heir(&all, guid(n)), Some(owner), "the same hash");
+            *owned.entry(owner).or_insert(0) += 1;
+        }
+        assert!(owned.len() == 3 && owned.values().all(|count| *count > 10), "{owned:?}");
+        assert_eq!(heir(&[], guid(1)), None);
+    }
+
+    #[test]
+    fn one_flow_writes_a_topic_to_a_network() {
+        let lines = ["e/a net1", "e/b net1", "e/c net1", "e/d net2", "e/x net1 draining"];
+        let world = world(&lines);
+        let networks = networks(&world);
+        let of = |flow: &str| {
+            let (id, view) = world.flows.get_key_value(&id(flow)).unwrap();
+            Network::of(id, view).unwrap()
+        };
+        let chosen = writer(&networks, of("e/a"), &topic()).unwrap();
+        assert_eq!(writer(&networks, of("e/c"), &topic()), Some(chosen));
+        assert_eq!(writer(&networks, of("e/d"), &topic()), Some(&id("e/d")));
+        for (name, is_one) in
+            [("add/_request", true), ("add/_reply", true), ("a/_request/b", false), ("x", false)]
+        {
+            assert_eq!(is_of_service(&name.parse().unwrap()), is_one, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_network_belongs_to_the_layer_whose_flow_is_older() {
+        let nobody = BTreeSet::new();
+        let of = |lines: &[&str], epochs: [u64; 2], found: &BTreeSet<FlowId>| {
+            let mut world = world(lines);
+            for (view, epoch) in world.flows.values_mut().zip(epochs) {
+                view.epoch = epoch;
+            }
+            world.me = id("f/m");
+            holder(&world, network(1), found).cloned()
+        };
+        let one = ["e/a net1", "f/m net1"];
+        let held = Some(id("e/a"));
+        assert_eq!(of(&one, [1, 2], &nobody), held);
+        assert_eq!(of(&one, [2, 2], &nobody), held, "the smaller name");
+        assert_eq!(of(&one, [3, 2], &nobody), None);
+        assert_eq!(of(&["e/a net1 starting", "f/m net1"], [1, 2], &nobody), held);
+        assert_eq!(of(&["e/a net1 down", "f/m net1"], [1, 2], &nobody), None);
+        assert_eq!(of(&["f/a net1", "f/m net1"], [1, 2], &nobody), None, "one layer");
+        let two = ["e/a net9", "f/m net1"];
+        assert_eq!(of(&two, [1, 2], &nobody), None);
+        assert_eq!(of(&two, [1, 2], &BTreeSet::from([id("e/a")])), held, "found on it");
+        assert_eq!(of(&["e/a", "f/m net1"], [1, 2], &BTreeSet::from([id("e/a")])), None);
+    }
+}
