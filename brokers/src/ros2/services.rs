@@ -15,11 +15,12 @@ use std::collections::{BTreeMap, HashMap};
 use blaze_domain::WriterId;
 use bytes::{BufMut, Bytes, BytesMut};
 use parking_lot::Mutex;
+use rustdds::rpc::SampleIdentity;
 use rustdds::{GUID, SequenceNumber};
 
 use super::endpoint::Vendor;
 use super::names::Carries;
-use crate::dds::{EndpointId, Sample, SampleIdentity};
+use crate::dds::{EndpointId, Sample};
 
 /// Requests of one client that wait for their replies; then the oldest is given up.
 const MAX_OF_CLIENT: usize = 1024;
@@ -151,8 +152,12 @@ impl<V> ByRequest<V> {
 
     /// Forgets all requests of some clients. Returns what they had.
     fn retain(&mut self, keeps: impl Fn(&Request, &V) -> bool) -> Vec<V> {
-        let gone: Vec<Request> =
-            self.all.iter().filter(|(request, value)| !keeps(request, value)).map(|it| *it.0).collect();
+        let gone: Vec<Request> = self
+            .all
+            .iter()
+            .filter(|(request, value)| !keeps(request, value))
+            .map(|it| *it.0)
+            .collect();
         gone.iter().filter_map(|request| self.remove(request)).collect()
     }
 }
@@ -280,7 +285,10 @@ mod tests {
         let (same, related) = OnWire::Related([3; 16], 7).put_on(&plain);
         let related = related.unwrap();
         assert_eq!(same, plain);
-        assert_eq!((related.writer_guid.to_bytes(), i64::from(related.sequence_number)), ([3; 16], 7));
+        assert_eq!(
+            (related.writer_guid.to_bytes(), i64::from(related.sequence_number)),
+            ([3; 16], 7)
+        );
     }
 
     #[test]

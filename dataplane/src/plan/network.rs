@@ -170,7 +170,9 @@ pub(crate) fn servers(survey: &Survey<'_>, topic: &TopicName) -> Servers {
             all.extend((flow.ros2.is_some() && entry.ros2.request.is_some()).then(|| id.clone()));
             // A gateway names the nodes of those that it speaks for.
             let told = entry.layer.request.iter().flat_map(|request| &request.services);
-            all.extend(told.filter_map(|of| Some(FlowId::new(id.layer.clone(), of.node.parse().ok()?))));
+            all.extend(
+                told.filter_map(|of| Some(FlowId::new(id.layer.clone(), of.node.parse().ok()?))),
+            );
         }
     }
     let (here, elsewhere) = all.into_iter().partition(|flow| flow.layer == world.me.layer);
@@ -301,8 +303,7 @@ mod tests {
         };
         assert_eq!(of(&[], &[]).choose(guid(1), Some(&id("f/a"))), None);
         let far = of(&[], &["f/a", "f/b"]);
-        let mut chosen: Vec<&FlowId> =
-            (0..40).filter_map(|n| far.choose(guid(n), None)).collect();
+        let mut chosen: Vec<&FlowId> = (0..40).filter_map(|n| far.choose(guid(n), None)).collect();
         chosen.sort();
         chosen.dedup();
         assert_eq!(chosen.len(), 2, "different clients have different ones");

@@ -1,7 +1,7 @@
 //! A message that is for one flow.
 
 use bytes::{BufMut, BytesMut};
-use prost::encoding::{encode_key, encode_varint, WireType};
+use prost::encoding::{WireType, encode_key, encode_varint};
 
 use super::{Frame, FrameError, MAX_HEADER_BYTES, PREFIX_BYTES};
 
