@@ -63,6 +63,7 @@ impl Dialect for Ros {
         _: Instant,
     ) -> Result<Box<dyn Companion>, DdsError> {
         self.relay.set_participant(participant.prefix());
+        self.knowledge.set_own(participant.prefix());
         let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,
@@ -197,7 +198,7 @@ impl Companion for Graph {
                 None => others.note_malformed(),
             }
         }
-        self.knowledge.tick(now, own);
+        self.knowledge.tick(now);
         false
     }
 }

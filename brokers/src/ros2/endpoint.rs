@@ -123,6 +123,12 @@ impl RosEndpoint {
 }
 
 impl RosEndpoint {
+    /// Whether its samples are messages of ROS 2: they have a type of ROS 2 and no keys.
+    #[must_use]
+    pub fn is_readable(&self) -> bool {
+        self.type_name.is_some() && !self.is_keyed
+    }
+
     /// Its lifespan in whole milliseconds, at least 1; 0 = none.
     #[must_use]
     pub fn lifespan_ms(&self) -> u32 {

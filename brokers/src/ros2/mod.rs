@@ -312,8 +312,7 @@ impl Read {
     /// Makes readers for types that writers have now.
     fn follow(&mut self, inner: &Inner) {
         for writer in inner.knowledge.endpoints(&self.name, true) {
-            let is_readable = writer.type_name.is_some() && !writer.is_keyed;
-            if !is_readable || self.types.contains(&writer.dds_type) {
+            if !writer.is_readable() || self.types.contains(&writer.dds_type) {
                 continue;
             }
             let terms = Terms { marked: true, ..Terms::default() };

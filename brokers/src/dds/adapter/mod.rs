@@ -14,6 +14,7 @@
 
 mod channel;
 mod deliver;
+mod doubtful;
 mod kept;
 mod life;
 mod make;
@@ -87,7 +88,7 @@ pub(crate) struct Encoded {
 pub(crate) enum Admission {
     Yes,
     No,
-    /// It is not known yet: they wait, at most [`channel::LONGEST_DOUBT`].
+    /// It is not known yet: they wait, at most three seconds.
     Later,
 }
 
