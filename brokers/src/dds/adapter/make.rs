@@ -46,7 +46,7 @@ impl Generation {
         let farewell =
             Farewell::new(shared.address, participant.port()).map_err(create_error("socket"))?;
         let near = Near::of_interface(shared.address);
-        let presence = Arc::new(Mutex::new(Presence::new(near)));
+        let presence = Arc::new(Mutex::new(Presence::new(near, shared.dialect.sign_topic().is_some())));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
             watch: participant.watch_endpoints(
