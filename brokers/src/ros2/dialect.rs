@@ -82,10 +82,6 @@ impl Dialect for Ros {
         }))
     }
 
-    fn mixes_durability(&self) -> bool {
-        true
-    }
-
     fn note_endpoints(&self, endpoints: &Endpoints) {
         self.knowledge.note_endpoints(Instant::now(), endpoints);
         if let Some(user) = self.user.get().and_then(Weak::upgrade) {

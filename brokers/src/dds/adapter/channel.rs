@@ -83,13 +83,12 @@ impl Channel {
     }
 
     /// Which readers it needs, where writers of these kinds are known; one stands in any case.
-    pub(super) fn wanted(&self, offered: [bool; 3], mixes: bool) -> [bool; 3] {
-        let [durable, reliable, best_effort] = offered;
-        if mixes && self.with_kept {
-            [durable, reliable || !(durable || best_effort), best_effort]
-        } else {
-            [self.with_kept, !self.with_kept, best_effort]
-        }
+    ///
+    /// All readers of a topic share one cache in RustDDS. Where a reliable writer that keeps nothing
+    /// joins one that does, both are read, but a reader that begins at the same moment may then miss
+    /// what is kept.
+    pub(super) fn wanted(&self, [_, reliable, best_effort]: [bool; 3]) -> [bool; 3] {
+        [self.with_kept, reliable || !self.with_kept, best_effort]
     }
 
     /// Whether its reader of a kind is the one that reads a writer, as far as that is known.
@@ -182,9 +181,8 @@ impl Channel {
     /// Whether it holds messages: those that were kept until their writers are quiet, and those of
     /// which it is not known yet whether they are read. Not to be waited for while a reader is made.
     fn holds_messages(&self) -> bool {
-        let holds = |readers: &Readers| {
-            !(readers.history.is_empty() && readers.doubtful.is_empty())
-        };
+        let holds =
+            |readers: &Readers| !(readers.history.is_empty() && readers.doubtful.is_empty());
         self.readers.try_lock().is_some_and(|readers| holds(&readers))
     }
 

@@ -114,11 +114,6 @@ pub(crate) trait Dialect: Send + Sync + 'static {
         now: Instant,
     ) -> Result<Box<dyn Companion>, DdsError>;
 
-    /// Whether writers of one topic may keep samples for late joiners, and others not.
-    fn mixes_durability(&self) -> bool {
-        false
-    }
-
     /// The topic on which participants of this kind tell that they live.
     fn sign_topic(&self) -> Option<&'static str> {
         None

@@ -134,3 +134,25 @@ async fn what_the_flow_writes_leaves_room_for_samples_that_wait_for_an_owner() {
     assert_eq!(until(&mut subscription, 2).await, [1, 2]);
     assert_eq!(subscription.take_dropped(), 0);
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_kept_is_read_beside_other_writers_of_the_topic() {
+    let net = Net::start().await;
+    let node = net.node();
+    let kept = node.typed_writer(("rt/map", TYPE), keeping(3)).unwrap();
+    (1..=3).for_each(|number| put(&kept, number));
+    net.own(&[kept.id()]).await;
+    let mut subscription = net.read("map", WITH_KEPT).await;
+    assert_eq!(until(&mut subscription, 3).await, [1, 2, 3]);
+    // Writers that keep nothing come later; they are read, too.
+    let reliable = node.typed_writer(("rt/map", TYPE), reliable(8)).unwrap();
+    let best_effort = node.typed_writer(("rt/map", TYPE), Profile::best_effort(8)).unwrap();
+    net.own(&[kept.id(), reliable.id(), best_effort.id()]).await;
+    for (writer, number) in [(&reliable, 4), (&best_effort, 5), (&kept, 6)] {
+        eventually("matched", || writer.is_matched().then_some(())).await;
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        put(writer, number);
+        assert_eq!(until(&mut subscription, number).await, [number]);
+    }
+    assert_eq!(subscription.take_dropped(), 0);
+}
