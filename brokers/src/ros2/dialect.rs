@@ -10,7 +10,6 @@ use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use super::Inner;
 use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
-use super::names::type_of_dds;
 use super::network::Knowledge;
 use crate::dds::adapter::{
     Admission, Companion, Dialect, Encoded, NoMessage, Others, Topic, nanos,
@@ -78,6 +77,7 @@ impl Dialect for Ros {
             gid: self.gid,
             node: self.flow.ros2_node(),
             knowledge: Arc::clone(&self.knowledge),
+            user: Arc::clone(&self.user),
             told: None,
         }))
     }
@@ -131,13 +131,8 @@ impl Dialect for Ros {
         frame.map(Content::Frame).map_err(|_| NoMessage::Malformed)
     }
 
-    fn encode(&self, topic: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
+    fn encode(&self, _: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
         let Body::Frame(frame) = message else { return Err(DropReason::BrokerError) };
-        if let Some((_, told)) = frame.encoding().split_once("type=")
-            && type_of_dds(&topic.type_name).as_deref() != Some(told.trim())
-        {
-            return Err(DropReason::BrokerError);
-        }
         let cdr = Cdr::little(frame.payload().clone()).ok_or(DropReason::BrokerError)?;
         let mut options = WriteOptionsBuilder::new();
         if let Some(written) = timestamp(frame.publish_time_ns()) {
@@ -175,6 +170,7 @@ struct Graph {
     /// Full name of the own node.
     node: String,
     knowledge: Arc<Knowledge>,
+    user: Arc<OnceLock<Weak<Inner>>>,
     told: Option<ParticipantNodes>,
 }
 
@@ -195,6 +191,9 @@ impl Companion for Graph {
             }
         }
         self.knowledge.tick(now);
+        if let Some(user) = self.user.get().and_then(Weak::upgrade) {
+            user.tick(now);
+        }
         false
     }
 }
