@@ -12,7 +12,7 @@ use rustdds::{Timestamp, WriteOptionsBuilder};
 use super::Inner;
 use super::endpoint::RosEndpoint;
 use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
-use super::names::{Carries, type_of_dds};
+use super::names::Carries;
 use super::network::Knowledge;
 use super::services::{Forwarded, OnWire, Services, carries};
 use crate::dds::adapter::{
@@ -67,6 +67,7 @@ impl Dialect for Ros {
         _: Instant,
     ) -> Result<Box<dyn Companion>, DdsError> {
         self.relay.set_participant(participant.prefix());
+        self.knowledge.set_own(participant.prefix());
         let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,
@@ -81,12 +82,9 @@ impl Dialect for Ros {
             gid: self.gid,
             node: self.flow.ros2_node(),
             knowledge: Arc::clone(&self.knowledge),
+            user: Arc::clone(&self.user),
             told: None,
         }))
-    }
-
-    fn mixes_durability(&self) -> bool {
-        true
     }
 
     fn note_endpoints(&self, endpoints: &Endpoints) {
@@ -143,13 +141,8 @@ impl Dialect for Ros {
         frame.map(Content::Frame).map_err(|_| NoMessage::Malformed)
     }
 
-    fn encode(&self, topic: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
+    fn encode(&self, _: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
         let Body::Frame(frame) = message else { return Err(DropReason::BrokerError) };
-        if let Some((_, told)) = frame.encoding().split_once("type=")
-            && type_of_dds(&topic.type_name).as_deref() != Some(told.trim())
-        {
-            return Err(DropReason::BrokerError);
-        }
         let cdr = Cdr::little(frame.payload().clone()).ok_or(DropReason::BrokerError)?;
         let mut options = WriteOptionsBuilder::new();
         if let Some(written) = timestamp(frame.publish_time_ns()) {
@@ -259,6 +252,7 @@ struct Graph {
     /// Full name of the own node.
     node: String,
     knowledge: Arc<Knowledge>,
+    user: Arc<OnceLock<Weak<Inner>>>,
     told: Option<ParticipantNodes>,
 }
 
@@ -278,7 +272,10 @@ impl Companion for Graph {
                 None => others.note_malformed(),
             }
         }
-        self.knowledge.tick(now, own);
+        self.knowledge.tick(now);
+        if let Some(user) = self.user.get().and_then(Weak::upgrade) {
+            user.tick(now);
+        }
         false
     }
 }
