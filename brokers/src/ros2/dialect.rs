@@ -83,9 +83,10 @@ impl Dialect for Ros {
     }
 
     fn note_endpoints(&self, endpoints: &Endpoints) {
-        self.knowledge.note_endpoints(Instant::now(), endpoints);
-        if let Some(user) = self.user.get().and_then(Weak::upgrade) {
-            user.follow();
+        let changed = self.knowledge.note_endpoints(Instant::now(), endpoints);
+        if let Some(user) = self.user.get().and_then(Weak::upgrade).filter(|_| !changed.is_empty())
+        {
+            user.follow(&changed);
         }
     }
 
@@ -184,7 +185,7 @@ impl Companion for Graph {
             let from = prefix_of(sample.writer_guid);
             match ParticipantNodes::read(&sample.sample) {
                 Some(told) if from != own && told.participant[..12] == from.0 => {
-                    self.knowledge.note_nodes(now, from, &told);
+                    self.knowledge.note_nodes(now, from, told.owners(from));
                 }
                 Some(_) => {}
                 None => others.note_malformed(),
