@@ -42,8 +42,8 @@ pub use reader::{OctetsSink, Reader, Sample, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
 pub use sample::{Cdr, octet_sequence};
 pub use watch::{EndpointWatch, Endpoints, FoundEndpoint};
-pub(crate) use writer::participant_of;
 pub use writer::{EndpointId, Writer, Written};
+pub(crate) use writer::{endpoint_of, participant_of};
 
 /// The type of all samples, IDL `sequence<octet>`.
 pub const FRAME_TYPE: &str = "blaze::v1::Frame";

@@ -14,7 +14,7 @@ use super::sample::{Cdr, CdrAdapter, octet_sequence};
 /// Identity of a reader or writer on the wire: its participant's and four bytes.
 pub type EndpointId = [u8; 16];
 
-pub(super) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
+pub(crate) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
     guid.to_bytes()
 }
 

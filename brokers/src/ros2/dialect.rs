@@ -21,7 +21,7 @@ use crate::dds::adapter::{
 use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
-    Relay, Sample, Terms, Writer, Written,
+    Relay, Sample, Terms, Writer, Written, endpoint_of,
 };
 use crate::outbox::Body;
 use crate::port::Content;
@@ -88,10 +88,13 @@ impl Dialect for Ros {
     }
 
     fn note_endpoints(&self, endpoints: &Endpoints) {
-        self.knowledge.note_endpoints(Instant::now(), endpoints);
+        let changed = self.knowledge.note_endpoints(Instant::now(), endpoints);
+        if changed.is_empty() {
+            return;
+        }
         self.knowledge.forget_requests(&mut self.services.lock());
         if let Some(user) = self.user.get().and_then(Weak::upgrade) {
-            user.follow();
+            user.follow(&changed);
         }
     }
 
@@ -266,7 +269,7 @@ impl Companion for Graph {
             let from = prefix_of(sample.writer_guid);
             match ParticipantNodes::read(&sample.sample) {
                 Some(told) if from != own && told.participant[..12] == from.0 => {
-                    self.knowledge.note_nodes(now, from, &told);
+                    self.knowledge.note_nodes(now, from, told.owners(from));
                 }
                 Some(_) => {}
                 None => others.note_malformed(),
@@ -283,7 +286,10 @@ impl Companion for Graph {
 impl Graph {
     /// Tells the own endpoints, if they are others than before.
     fn tell(&mut self, own: GuidPrefix, others: &Others<'_>) {
-        let (readers, writers) = others.own_endpoints();
+        let (mut readers, mut writers) = others.own_endpoints();
+        // Other flows know it by these, also when it has nothing else there.
+        readers.push(endpoint_of(self.reader.guid()));
+        writers.push(self.writer.id());
         let Some((namespace, name)) = self.node.rsplit_once('/') else { return };
         let (namespace, name) = (namespace.to_owned(), name.to_owned());
         let node = Node { namespace, name, readers, writers };

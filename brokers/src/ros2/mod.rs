@@ -242,21 +242,19 @@ impl Broker for Ros2Broker {
 }
 
 impl Inner {
-    /// Readers and writers follow the endpoints of others.
-    fn follow(&self) {
-        self.offers().iter().for_each(|offer| offer.follow(self));
-        let shown = self.shown.lock().names();
-        shown.iter().for_each(|name| self.follow_shown(name));
-        self.reads.lock().retain_mut(|read| {
-            read.follow(self);
-            !read.sender.is_closed()
-        });
+    /// Readers and writers of these names follow the endpoints of others.
+    fn follow(&self, names: &BTreeSet<RosName>) {
+        for name in names {
+            self.offers_of(name).iter().for_each(|offer| offer.follow(self));
+            self.follow_shown(name);
+        }
+        let mut reads = self.reads.lock();
+        reads.iter_mut().filter(|read| names.contains(&read.name)).for_each(|it| it.follow(self));
     }
 
     /// What shows of a topic follows the writers that are used.
     fn follow_shown(&self, name: &RosName) {
-        let offers: Vec<Arc<Offer>> =
-            self.offers.lock().get(name).into_iter().flatten().filter_map(Weak::upgrade).collect();
+        let offers = self.offers_of(name);
         self.shown.lock().follow(self, name, offers.iter().map(Arc::as_ref));
     }
 
@@ -325,11 +323,14 @@ impl Inner {
 
     /// What takes time has its turn.
     fn tick(&self, now: Instant) {
-        self.offers().iter().for_each(|offer| offer.tick(self, now));
+        let offers: Vec<Arc<Offer>> =
+            self.offers.lock().values().flatten().filter_map(Weak::upgrade).collect();
+        offers.iter().for_each(|offer| offer.tick(self, now));
+        self.reads.lock().retain(|read| !read.sender.is_closed());
     }
 
-    fn offers(&self) -> Vec<Arc<Offer>> {
-        self.offers.lock().values().flatten().filter_map(Weak::upgrade).collect()
+    fn offers_of(&self, name: &RosName) -> Vec<Arc<Offer>> {
+        self.offers.lock().get(name).into_iter().flatten().filter_map(Weak::upgrade).collect()
     }
 }
 

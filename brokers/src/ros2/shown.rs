@@ -54,11 +54,6 @@ impl AllShown {
         true
     }
 
-    /// Names of all of them.
-    pub(super) fn names(&self) -> Vec<RosName> {
-        self.by_name.keys().cloned().collect()
-    }
-
     /// Makes the idle writer of a topic, or one that offers what readers ask for now; ends the one
     /// that is not needed beside those of `offers`.
     pub(super) fn follow<'a>(

@@ -9,7 +9,7 @@ use super::Admission;
 use crate::dds::EndpointId;
 
 /// How long a sample waits.
-pub(super) const LONGEST_DOUBT: Duration = Duration::from_secs(3);
+pub(crate) const LONGEST_DOUBT: Duration = Duration::from_secs(3);
 /// Samples of one writer that wait in a channel; then the oldest are lost.
 const MAX_SAMPLES: usize = 1024;
 /// Bytes of all that wait in one adapter; then the oldest of the same writer are lost.

@@ -52,6 +52,7 @@ use shared::Shared;
 
 pub(crate) use channel::MAX_CHANNELS;
 pub(crate) use deliver::nanos;
+pub(crate) use doubtful::LONGEST_DOUBT;
 pub(crate) use make::Others;
 pub(crate) use send::MAX_ORIGINS;
 pub use shared::MAX_QUEUE_BYTES;
@@ -90,7 +91,7 @@ pub(crate) struct Encoded {
 pub(crate) enum Admission {
     Yes,
     No,
-    /// It is not known yet: they wait, at most three seconds.
+    /// It is not known yet: they wait, at most [`LONGEST_DOUBT`].
     Later,
 }
 

@@ -271,3 +271,45 @@ async fn a_reader_that_asks_for_more_than_is_published_is_served() {
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_message_of_a_writer_that_leaves_at_once_is_read() {
+    let net = Net::start().await;
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    let steady = net.node();
+    let other = steady.typed_writer(("rt/a", TYPE), reliable(8)).unwrap();
+    net.own(&[other.id()]).await;
+    eventually("matched", || other.is_matched().then_some(())).await;
+    let node = net.node();
+    let writer = node.typed_writer(("rt/a", TYPE), reliable(8)).unwrap();
+    let id = writer.id();
+    eventually("matched", || writer.is_matched().then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    put(&writer, 1);
+    eventually("acknowledged", || writer.is_acknowledged().then_some(())).await;
+    drop((writer, node));
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    net.own(&[other.id(), id]).await;
+    assert_eq!(until(&mut subscription, 1).await, [1]);
+    assert_eq!(subscription.take_dropped(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_nobody_decides_about_counts_as_lost() {
+    let net = Net::start().await;
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    let node = net.node();
+    let [owned, nobodys] =
+        [(); 2].map(|()| node.typed_writer(("rt/a", TYPE), reliable(8)).unwrap());
+    net.own(&[owned.id()]).await;
+    for writer in [&owned, &nobodys] {
+        eventually("matched", || writer.is_matched().then_some(())).await;
+    }
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    put(&nobodys, 1);
+    put(&nobodys, 2);
+    let dropped = || Some(subscription.take_dropped()).filter(|dropped| *dropped > 0);
+    assert_eq!(eventually("lost", dropped).await, 2);
+    put(&owned, 3);
+    assert_eq!(until(&mut subscription, 3).await, [3]);
+}
