@@ -12,6 +12,7 @@
 mod compressed;
 mod header;
 mod index;
+mod recoded;
 
 #[cfg(test)]
 mod tests;
