@@ -9,6 +9,7 @@ use blaze_domain::control::EventKind;
 use super::info::{Sources, announced_bytes, durable_sources, local_info, types};
 use super::routes::route_states;
 use super::{ControlCore, LATEST, Output, QUIET, event};
+use crate::plan::network::{self, Shown};
 use crate::plan::{Survey, TopicPlan, plan_within};
 use crate::registry::{MAX_ROUTES, carrying_states};
 use crate::types::TopicTypes;
@@ -28,6 +29,8 @@ struct Draft {
     types: TopicTypes,
     /// Some flow announces something of the topic.
     is_known: bool,
+    /// How it shows on the own ROS 2 network.
+    shown: Option<Shown>,
 }
 
 pub(super) struct Dirty {
@@ -103,14 +106,16 @@ impl ControlCore {
                 max_bytes: announced_bytes(&holders, topic),
                 types: types(&self.registry, &holders, topic),
                 is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
+                shown: network::shown(&survey, topic),
             }
         };
         topics.iter().map(draft).collect()
     }
 
     fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
+        let Draft { mut plan, durable, max_bytes, types, is_known, shown } = draft;
+        self.show(topic, shown);
         let previous = self.plans.get(topic);
-        let Draft { mut plan, durable, max_bytes, types, is_known } = draft;
         if is_known
             && previous == Some(&plan)
             && plan.bridges.is_empty()
