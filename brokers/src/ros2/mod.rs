@@ -17,6 +17,7 @@ mod graph;
 pub mod names;
 mod network;
 mod offers;
+mod services;
 mod shown;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -41,6 +42,7 @@ use dialect::Ros;
 use names::{RosName, type_to_dds};
 use network::Knowledge;
 use offers::{Offer, Offered};
+use services::Services;
 use shown::AllShown;
 
 pub use dialect::KEPT_SAMPLES;
@@ -84,6 +86,7 @@ pub struct Ros2Broker {
 struct Inner {
     adapter: Adapter,
     knowledge: Arc<Knowledge>,
+    services: Arc<Services>,
     namespace: String,
     offers: Mutex<BTreeMap<RosName, Vec<Weak<Offer>>>>,
     reads: Mutex<Vec<Read>>,
@@ -118,11 +121,13 @@ impl Ros2Broker {
             holds_multicast: false,
             repeat: ANNOUNCE,
         })?;
+        let services = Arc::<Services>::default();
         let user = Arc::<OnceLock<Weak<Inner>>>::default();
         let ros = Ros {
             flow: config.flow,
             gid: config.gid,
             knowledge: Arc::clone(&knowledge),
+            services: Arc::clone(&services),
             relay,
             user: Arc::clone(&user),
         };
@@ -130,6 +135,7 @@ impl Ros2Broker {
         let inner = Arc::new(Inner {
             adapter,
             knowledge,
+            services,
             namespace: config.namespace,
             offers: Mutex::default(),
             reads: Mutex::default(),
@@ -143,6 +149,13 @@ impl Ros2Broker {
     #[must_use]
     pub fn network(&self) -> watch::Receiver<Arc<Network>> {
         self.inner.knowledge.subscribe()
+    }
+
+    /// Requests to services that wait for their replies, and those that were given up because
+    /// there were too many.
+    #[must_use]
+    pub fn requests(&self) -> (usize, u64) {
+        self.inner.services.lock().counts()
     }
 
     /// What it has counted.

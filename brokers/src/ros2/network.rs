@@ -5,12 +5,15 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use blaze_domain::WriterId;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::endpoint::RosEndpoint;
+use super::endpoint::{RosEndpoint, Vendor};
 use super::graph::ParticipantNodes;
 use super::names::RosName;
+use super::services;
+
 use crate::dds::adapter::Admission;
 
 use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix, participant_of};
@@ -152,6 +155,24 @@ impl Knowledge {
         let state = self.state.lock();
         let found = state.by_name.get(name).map(|of_name| &of_name[usize::from(writers)]);
         found.cloned().unwrap_or_default()
+    }
+
+    /// Whether the first server that reads these requests is of Cyclone.
+    pub(super) fn is_served_by_cyclone(&self, dds_topic: &str) -> bool {
+        let servers = RosName::of_dds(dds_topic).map(|name| self.endpoints(&name, false));
+        let first = servers.as_ref().and_then(|servers| servers.iter().min_by_key(|it| it.id));
+        first.is_some_and(|server| server.vendor == Vendor::CycloneDds)
+    }
+
+    /// Requests are forgotten whose clients or servers have gone.
+    pub(super) fn forget_requests(&self, requests: &mut services::State) {
+        let state = self.state.lock();
+        let is_client = |client: &WriterId| state.endpoints.contains_key(&client.0);
+        let is_served = |topic: &str| {
+            let name = RosName::of_dds(topic);
+            name.and_then(|name| state.by_name.get(&name)).is_some_and(|it| !it[0].is_empty())
+        };
+        requests.retain(is_client, is_served);
     }
 
     fn publish(&self, state: &State, now: Instant) {

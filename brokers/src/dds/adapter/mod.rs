@@ -39,6 +39,7 @@ use super::participant::Terms;
 use super::reader::StoppableThread;
 use super::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Sample,
+    Writer, Written,
 };
 use crate::outbox::{Admission as OutboxAdmission, Body, LanePublisher};
 use crate::port::{
@@ -142,6 +143,21 @@ pub(crate) trait Dialect: Send + Sync + 'static {
     /// # Errors
     /// Why it is dropped.
     fn encode(&self, topic: &Topic, message: &Body, durable: bool) -> Result<Encoded, DropReason>;
+
+    /// Hands a message to its writer.
+    ///
+    /// # Errors
+    /// Why it is dropped.
+    fn write(
+        &self,
+        topic: &Topic,
+        message: &Body,
+        durable: bool,
+        writer: &Writer,
+    ) -> Result<Written, DropReason> {
+        let Encoded { cdr, options } = self.encode(topic, message, durable)?;
+        Ok(writer.write_cdr(cdr, options))
+    }
 
     /// What own readers of a topic get of a message that this participant writes, if anything.
     fn own(&self, topic: &Topic, message: &Body) -> Option<Content>;

@@ -237,7 +237,7 @@ fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<F
     let topic = &slot.key.topic;
     let durable = slot.key.depth > 0;
     let body = aged(waiting, now);
-    match slot.write(now, || shared.dialect.encode(topic, &body, durable)) {
+    match slot.write(now, |writer| shared.dialect.write(topic, &body, durable, writer)) {
         Attempt::Done => {
             shared.channels.deliver_own(&topic.name, || shared.dialect.own(topic, &body));
             Some(Fate::Delivered)

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::{DropReason, WriterId};
 use parking_lot::Mutex;
 
-use super::{Encoded, Topic};
+use super::Topic;
 use crate::dds::{Profile, Writer, Written};
 
 /// How long a new writer waits for its first reader: discovery takes that long where there is one.
@@ -101,7 +101,7 @@ impl Slot {
     pub(super) fn write(
         &self,
         now: Instant,
-        encode: impl FnOnce() -> Result<Encoded, DropReason>,
+        write: impl FnOnce(&Writer) -> Result<Written, DropReason>,
     ) -> Attempt {
         let mut state = self.state.lock();
         let state = &mut *state;
@@ -120,20 +120,17 @@ impl Slot {
             }
             state.settled = true;
         }
-        let encoded = match encode() {
-            Ok(encoded) => encoded,
-            Err(reason) => return Attempt::Dropped(reason),
-        };
-        match writer.write_cdr(encoded.cdr, encoded.options) {
-            Written::Taken(_) | Written::NoReader => {
+        match write(writer) {
+            Ok(Written::Taken(_) | Written::NoReader) => {
                 state.full_since = None;
                 Attempt::Done
             }
-            Written::Full => {
+            Ok(Written::Full) => {
                 state.full_since.get_or_insert(now);
                 Attempt::NotNow
             }
-            Written::Failed => Attempt::Dropped(DropReason::BrokerError),
+            Ok(Written::Failed) => Attempt::Dropped(DropReason::BrokerError),
+            Err(reason) => Attempt::Dropped(reason),
         }
     }
 

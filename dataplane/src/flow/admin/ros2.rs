@@ -55,6 +55,7 @@ pub(super) async fn ros2(State(shared): App) -> Response {
         "domain": ros2.domain, "interface": ros2.interface, "state": state, "detail": detail,
         "guid_prefix": network.own.map(|own| own.to_string()), "node": shared.me.ros2_node(),
         "participants": network.participants, "endpoints": endpoints,
+        "calls": {"pending": ros2.broker.requests().0},
     });
     drop(control);
     answer(&shared, answers).into_response()
