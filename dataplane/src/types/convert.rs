@@ -4,6 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use blaze_convert::limits::MAX_MESSAGE_BYTES;
 use blaze_convert::{ConvertError, Program, TypeHash};
 use blaze_domain::{DropReason, WhyCode};
 use bytes::Bytes;
@@ -127,10 +128,11 @@ impl CompiledType {
     /// Why it cannot be converted.
     pub fn convert(&self, to: Encoding, payload: &[u8]) -> Result<Converted, ConvertFailure> {
         let began = Instant::now();
-        let mut out = Vec::with_capacity(match to {
+        let about = match to {
             Encoding::Json => payload.len().saturating_mul(2),
             Encoding::Cdr => payload.len(),
-        });
+        };
+        let mut out = Vec::with_capacity(about.min(MAX_MESSAGE_BYTES));
         match to {
             Encoding::Json => self.program.to_json(payload, &mut out)?,
             Encoding::Cdr => self.program.to_cdr(payload, &mut out)?,

@@ -3,6 +3,7 @@
 use std::fs;
 
 use blaze_brokers::Subscription;
+use blaze_brokers::memory::MemoryBroker;
 use blaze_domain::node_file::{Ros2Live, TopicPattern};
 use blaze_domain::{Origin, WriterId};
 use blaze_proto::{Frame, Header};
@@ -23,14 +24,21 @@ fn request_json(topic: &str) -> Value {
     message
 }
 
-async fn listen(server: &Server, channel: &str) -> Subscription {
-    let client = server.hub.broker();
-    let options = SubscribeOptions::default();
-    client.subscribe(&channel.parse().unwrap(), options).await.unwrap()
+/// A client that reads a channel.
+struct Client {
+    subscription: Subscription,
+    _broker: MemoryBroker,
 }
 
-async fn text(subscription: &mut Subscription) -> String {
-    match receive(subscription).await.content {
+async fn listen(server: &Server, channel: &str) -> Client {
+    let broker = server.hub.broker();
+    let channel = channel.parse().unwrap();
+    let subscription = broker.subscribe(&channel, SubscribeOptions::default()).await.unwrap();
+    Client { subscription, _broker: broker }
+}
+
+async fn text(client: &mut Client) -> String {
+    match receive(&mut client.subscription).await.content {
         Content::Bare { payload, .. } => String::from_utf8(payload.to_vec()).unwrap(),
         other => panic!("{other:?}"),
     }
@@ -121,7 +129,7 @@ async fn small_and_large_messages_of_a_writer_stay_in_order() {
     let publisher = client.publisher(&"log".parse().unwrap(), PublisherOptions::default()).unwrap();
     let origin = Origin { layer: "fog".into(), node: "fog-1".into(), ..Origin::default() };
     for sequence in 1..=MESSAGES {
-        let length = if sequence % 3 == 0 { 30_000 } else { 10 };
+        let length = if sequence.is_multiple_of(3) { 30_000 } else { 10 };
         let header = Header {
             encoding: "application/cdr; type=std_msgs/msg/String".into(),
             ..Header::new("log", origin.clone(), WriterId([7; 16]), sequence, 1)
