@@ -470,6 +470,11 @@ pub(crate) trait Admission: Send + Sync {
 
     /// A message has been queued; it may have been shut meanwhile.
     fn queued(&self) {}
+
+    /// Whether the server keeps headers beside the payload.
+    fn has_headers(&self) -> bool {
+        false
+    }
 }
 
 /// Writes one channel through a lane.
@@ -501,6 +506,14 @@ impl<C: Send + Sync, A: Admission> Publisher for LanePublisher<C, A> {
     /// for late joiners.
     fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome {
         self.push(Body::Bare(payload.clone()), payload.len(), deadline)
+    }
+
+    fn publish_copy(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
+        if self.admission.has_headers() {
+            self.publish(frame, deadline)
+        } else {
+            self.publish_bare(frame.payload(), deadline)
+        }
     }
 
     fn later(&self) -> Later {

@@ -356,6 +356,12 @@ pub trait Publisher: Send + Sync {
     /// Hands over a payload as it is: for reserved channels and bare ones.
     fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome;
 
+    /// Hands over a copy for clients without the frame: the payload as it is, and the header where
+    /// the server has a place beside it (Kafka).
+    fn publish_copy(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
+        self.publish_bare(frame.payload(), deadline)
+    }
+
     /// What became of the messages that were taken.
     fn later(&self) -> Later;
 }

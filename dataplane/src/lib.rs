@@ -12,5 +12,6 @@ pub mod plan;
 pub mod registry;
 #[cfg(test)]
 mod testing;
+pub mod types;
 pub mod why;
 pub mod world;

@@ -13,6 +13,7 @@ mod addressed;
 mod compressed;
 mod header;
 mod index;
+mod recoded;
 
 #[cfg(test)]
 mod tests;

@@ -263,4 +263,8 @@ impl Admission for TopicAdmission {
     fn is_shut(&self) -> bool {
         !self.shared.gate.lets(self.stays_open)
     }
+
+    fn has_headers(&self) -> bool {
+        true
+    }
 }

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use blaze_domain::names::ChannelName;
-use blaze_domain::{MAX_PAYLOAD_BYTES, WriterId};
+use blaze_domain::{MAX_PAYLOAD_BYTES, TopicName, WriterId};
 use bytes::Bytes;
 
 use super::Fixture;
@@ -166,6 +166,14 @@ pub async fn reserved_channels_carry_json_as_it_is(fixture: &dyn Fixture) -> Out
         if reader.next_bare(&format!("JSON on {channel}")).await? != json {
             return Err(format!("JSON on {channel} came with other bytes"));
         }
+    }
+    let topic: TopicName = "imu/data".parse().map_err(|error| format!("{error}"))?;
+    let channel = ChannelName::json(&topic);
+    let (mut reader, publisher, _clients) = apart(fixture, &channel, true).await?;
+    let copy = frame(&channel, writer(1), 1, json.clone())?;
+    let outcome = publisher.publish_copy(&copy, None);
+    if outcome != PublishOutcome::Taken || reader.next_bare("a copy as JSON").await? != json {
+        return Err(format!("a copy on {channel} was {outcome:?}, or came with other bytes"));
     }
     Ok(())
 }

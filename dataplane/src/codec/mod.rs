@@ -1,10 +1,11 @@
-//! Compression of payloads for the inter scope.
+//! Compression of payloads for the inter scope, and the threads that convert large ones.
 //!
 //! ```text
 //!                 effort: at which level? ◄──────────── what it cost
 //!                    │                                       ▲
 //! admitted ─► order: a place ─► pool: a turn ─► lz4 ─► order: finished ─► in the order of each writer ─► lanes
 //! received, and not seen before ─► order: a place ─► pool: a turn, first ─► lz4 ─► in order ─► bridges to brokers
+//! for a broker, as JSON or CDR ──► order: a place ─► pool: a turn ─► types ─► in order ─► broker
 //! ```
 //!
 //! Each part is whole by itself: [`lz4`] is the codec, [`order`] keeps messages in order while some
@@ -18,6 +19,8 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use nix::time::{ClockId, clock_gettime};
 
+use crate::types::{Conversion, ConvertFailure, Converted};
+
 pub mod effort;
 pub mod lz4;
 pub mod order;
@@ -27,12 +30,14 @@ pub mod pool;
 mod tests;
 
 /// What is to be done with a payload.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub enum Work {
     /// Compress it at a level.
     Compress(u8),
     /// Decompress it; so large it says that it will be.
     Decompress(u64),
+    /// Convert it to another encoding.
+    Convert(Conversion),
 }
 
 /// What became of it.
@@ -44,6 +49,8 @@ pub enum Done {
     Decompressed(Bytes),
     /// It cannot be.
     Refused(lz4::Refused),
+    /// It was converted, or cannot be.
+    Converted(Result<Converted, ConvertFailure>),
     /// The codec has panicked.
     Failed,
 }
@@ -75,9 +82,10 @@ impl Compressed {
 impl Work {
     /// Does it, on the thread of the caller.
     #[must_use]
-    pub fn run(self, payload: &[u8]) -> Done {
+    pub fn run(&self, payload: &[u8]) -> Done {
         match self {
             Self::Compress(level) => {
+                let level = *level;
                 let (began, began_on_processor) = (Instant::now(), processor_time());
                 let block = lz4::compress(payload, level);
                 Done::Compressed(Compressed {
@@ -88,10 +96,11 @@ impl Work {
                     taken: began.elapsed(),
                 })
             }
-            Self::Decompress(announced) => match lz4::decompress(payload, announced) {
+            Self::Decompress(announced) => match lz4::decompress(payload, *announced) {
                 Ok(payload) => Done::Decompressed(payload),
                 Err(reason) => Done::Refused(reason),
             },
+            Self::Convert(conversion) => Done::Converted(conversion.run(payload)),
         }
     }
 }

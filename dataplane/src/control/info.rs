@@ -2,12 +2,13 @@
 
 use std::collections::BTreeSet;
 
-use blaze_domain::control::DEFAULT_ENCODING;
+use blaze_domain::control::{DEFAULT_ENCODING, LeaseKind};
 use blaze_domain::{Durability, FlowId, MAX_PAYLOAD_BYTES, Reliability, Scope, TopicName};
 
 use crate::lane::path::{BareInfo, TopicInfo};
 use crate::plan::network::Servers;
 use crate::registry::{LeaseView, Registry, Terms};
+use crate::types::{MessageType, TopicTypes, Wanted};
 use crate::world::{FlowView, OriginFilter, TopicEntry};
 
 /// The largest payload in bytes that any flow announces of a topic. Of which connection a message
@@ -18,6 +19,71 @@ pub(super) fn announced_bytes(holders: &[(&FlowId, &FlowView)], topic: &TopicNam
     let scopes = entries.flat_map(TopicEntry::scopes);
     let largest = scopes.filter_map(|(_, scope)| scope.advertise.as_ref()?.max_bytes).max();
     largest.map(|bytes| bytes.min(MAX_PAYLOAD_BYTES as u64))
+}
+
+/// The types of a topic: that of its publishers, of all flows, and that of its readers on the own
+/// ROS 2 network.
+pub(super) fn types(
+    registry: &Registry,
+    holders: &[(&FlowId, &FlowView)],
+    topic: &TopicName,
+) -> TopicTypes {
+    let entries = holders.iter().filter_map(|(_, view)| view.topics.get(topic));
+    let offers = entries.flat_map(TopicEntry::scopes);
+    let offers = offers.filter_map(|(_, scope)| scope.advertise.as_ref());
+    let published: BTreeSet<(&str, &str)> = offers
+        .filter(|offer| !offer.type_name.is_empty())
+        .map(|offer| (offer.type_name.as_str(), offer.type_hash.as_str()))
+        .collect();
+    let published = only(&published).ok().flatten();
+    let readers = registry.found(topic).map(|(endpoint, _)| endpoint);
+    let readers: BTreeSet<(&str, &str)> = readers
+        .filter(|endpoint| endpoint.kind == LeaseKind::Request)
+        .map(|endpoint| (endpoint.type_name.as_str(), endpoint.type_hash.as_str()))
+        .collect();
+    TopicTypes { wanted: wanted(&readers, published.as_ref()), published }
+}
+
+/// The only type, with its hash if one of them gives it; or all their names.
+fn only(types: &BTreeSet<(&str, &str)>) -> Result<Option<MessageType>, String> {
+    let names: BTreeSet<&str> = types.iter().map(|(name, _)| *name).collect();
+    let mut hashes = types.iter().map(|(_, hash)| *hash).filter(|hash| !hash.is_empty());
+    let hash = hashes.next().unwrap_or_default();
+    match names.first() {
+        None => Ok(None),
+        Some(name) if names.len() > 1 => {
+            let others = names.iter().skip(1).copied().collect::<Vec<_>>().join(", ");
+            Err(format!("{name}, {others}"))
+        }
+        Some(name) if hashes.next().is_some() => Err(format!("{name} in several versions")),
+        Some(name) => Ok(Some(MessageType { name: *name, hash }.owned())),
+    }
+}
+
+/// The type that JSON becomes for these readers.
+fn wanted(readers: &BTreeSet<(&str, &str)>, published: Option<&MessageType>) -> Wanted {
+    let Some(published) = published else {
+        return match only(readers) {
+            Ok(Some(ty)) => Wanted::Type(ty),
+            Ok(None) => Wanted::Nothing,
+            Err(types) => Wanted::Mismatch(format!(
+                "readers ask for {types}: name one as `type` of the publisher"
+            )),
+        };
+    };
+    let differ = |a: &str, b: &str| !a.is_empty() && !b.is_empty() && a != b;
+    let fits =
+        |(name, hash): &&(&str, &str)| *name == published.name && !differ(hash, &published.hash);
+    match only(&readers.iter().filter(fits).copied().collect()) {
+        Ok(Some(ty)) => Wanted::Type(ty),
+        Ok(None) if readers.is_empty() => Wanted::Nothing,
+        _ => {
+            let mut names: Vec<&str> = readers.iter().map(|(name, _)| *name).collect();
+            names.dedup();
+            let (names, name) = (names.join(", "), &published.name);
+            Wanted::Mismatch(format!("{name} is published, readers ask for {names}"))
+        }
+    }
 }
 
 /// What the advertisements of a topic on this flow's own brokers say.
@@ -39,6 +105,7 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
         max_bytes: offers().filter_map(|(_, bytes)| bytes).max(),
         rate_hz: offers().map(|(rate, _)| rate).sum::<Option<f64>>().filter(|_| !all.is_empty()),
         access: registry.access_of(topic),
+        types: TopicTypes::default(),
         servers: Servers::default(),
     }
 }

@@ -33,6 +33,7 @@ use crate::link::LinkEvent;
 use crate::link::transport::Endpoint;
 use crate::plan::{PlanRules, TopicPlan};
 use crate::registry::{EventDraft, Registry, RegistryConfig};
+use crate::types::ConvertFailure;
 use crate::world::{FlowState, OriginFilter, Reach, World};
 use balance::Balance;
 pub use balance::{LastMove, MoveReason, Moves, STAY};
@@ -258,6 +259,18 @@ impl ControlCore {
         self.hurry(now);
     }
 
+    /// A message could not be converted.
+    pub fn convert_failed(&mut self, wall_ms: u64, topic: TopicName, failure: ConvertFailure) {
+        let ConvertFailure { code, detail } = failure;
+        let draft = EventDraft {
+            event: EventKind::ConvertFailed,
+            topic: Some(topic),
+            code: code.as_str(),
+            detail,
+        };
+        self.tell(&draft, wall_ms);
+    }
+
     /// Does what is due. To be called every few ten milliseconds.
     pub fn tick(&mut self, now: Instant, wall_ms: u64) {
         self.follow_choice(now);
@@ -315,7 +328,13 @@ impl ControlCore {
 
     fn tell(&mut self, event: &EventDraft, wall_ms: u64) {
         if !event.detail.is_empty() {
-            tracing::info!(event = event.event.as_str(), code = event.code, "{}", event.detail);
+            tracing::info!(
+                event = event.event.as_str(),
+                topic = event.topic.as_ref().map(TopicName::as_str),
+                code = event.code,
+                "{}",
+                event.detail,
+            );
         }
         let body = Bytes::from(event.stamp(&self.config.me, wall_ms).to_json().to_string());
         let scopes = [

@@ -6,12 +6,13 @@ use std::time::Instant;
 use blaze_domain::TopicName;
 use blaze_domain::control::EventKind;
 
-use super::info::{Sources, announced_bytes, durable_sources, local_info};
+use super::info::{Sources, announced_bytes, durable_sources, local_info, types};
 use super::routes::route_states;
 use super::{ControlCore, LATEST, Output, QUIET, event};
 use crate::plan::network::{self, Servers, Shown};
 use crate::plan::{Survey, TopicPlan, plan_within};
 use crate::registry::{MAX_ROUTES, carrying_states};
+use crate::types::TopicTypes;
 use crate::world::OriginFilter;
 
 /// Sources of one topic that are remembered while nobody can tell whether they are gone.
@@ -24,6 +25,8 @@ struct Draft {
     durable: Sources,
     /// The largest payload that any flow announces of it, in bytes.
     max_bytes: Option<u64>,
+    /// Its types.
+    types: TopicTypes,
     /// Some flow announces something of the topic.
     is_known: bool,
     /// How it shows on the own ROS 2 network.
@@ -103,6 +106,7 @@ impl ControlCore {
                 plan: plan_within(&survey, topic, &self.config.rules, self.plans.get(topic)),
                 durable: durable_sources(&holders, topic),
                 max_bytes: announced_bytes(&holders, topic),
+                types: types(&self.registry, &holders, topic),
                 is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
                 shown: network::shown(&survey, topic),
                 servers: network::servers(&survey, topic),
@@ -112,7 +116,7 @@ impl ControlCore {
     }
 
     fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
-        let Draft { mut plan, durable, max_bytes, is_known, shown, servers } = draft;
+        let Draft { mut plan, durable, max_bytes, types, is_known, shown, servers } = draft;
         self.show(topic, shown);
         let previous = self.plans.get(topic);
         if is_known
@@ -136,6 +140,7 @@ impl ControlCore {
         let duty = self.duty(now, topic, carried, &plan);
         let mut info = Box::new(local_info(&self.registry, topic));
         info.max_bytes = info.max_bytes.max(max_bytes);
+        info.types = types;
         info.servers = servers;
         if plan.bridges.is_empty() && !is_known {
             self.plans.remove(topic);

@@ -158,6 +158,7 @@ impl ControlTask {
                 self.ready.notify_one();
             }
         }
+        self.report_failures();
         self.carry_out_all(now);
         self.empty(now);
         self.shared.allocate(now);
@@ -166,6 +167,14 @@ impl ControlTask {
         }
         // A flow without an inter scope has no pacer that would do it.
         self.shared.plane.with(|state| state.run_timers(now));
+    }
+
+    /// Lets the control core publish events about messages that could not be converted.
+    fn report_failures(&self) {
+        let failures = self.shared.plane.read(|state| state.core.take_convert_failures());
+        for (topic, failure) in failures {
+            self.shared.control.lock().convert_failed(wall_ms(), topic, failure);
+        }
     }
 
     /// Tells the control core once a second what this flow carries.

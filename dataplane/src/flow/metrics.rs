@@ -49,6 +49,8 @@ counter blaze_flow_compression_seconds topic Processor time of compression.
 gauge blaze_flow_compression_level topic Level of now; 0: payloads go as they are.
 gauge blaze_flow_compression_pool state Threads that compress, and what waits for them.
 counter blaze_flow_compression_pool_seconds - Time that the threads were taken, all together.
+counter blaze_flow_converted_total topic,form Messages that became JSON or CDR.
+counter blaze_flow_convert_seconds topic Time that conversions took.
 counter blaze_flow_wire_bytes_total to,class IP bytes sent on the inter scope.
 gauge blaze_flow_peer_up peer 1 while the peer says Hello and acknowledges.
 gauge blaze_flow_peer_rtt_seconds peer Round trip to the peer.
@@ -181,6 +183,15 @@ impl Page {
             if topic != OTHER {
                 self.add("blaze_flow_compression_level", &[topic], f64::from(path.level()));
             }
+        }
+        let stats = &path.convert_stats;
+        for (form, count) in [("json", stats.json), ("cdr", stats.cdr)] {
+            if count > 0 {
+                self.add("blaze_flow_converted_total", &[topic, form], count as f64);
+            }
+        }
+        if stats.json + stats.cdr > 0 {
+            self.add("blaze_flow_convert_seconds", &[topic], stats.seconds);
         }
         let measured = path.in_rate.rate(now).0;
         let granted = path.granted.map(|granted| granted.advertised_hz);

@@ -11,7 +11,7 @@
 //! | inter thread | joins and leaves the inter scope, as the control core wants | 1 where there is one |
 //! | pacer thread | link engine → transport, within the budget | 1 |
 //! | transport threads | transport → link engine → message path → brokers | 3 readers and DDS's own |
-//! | compression threads | a payload from the message path → LZ4 → message path | as many as processors |
+//! | codec threads | a payload from the message path → LZ4, or JSON or CDR → message path | as many as processors |
 //! | codec task | ends these with the process | 1 |
 //! | service | its configuration from BlazeConfig, its sign of life: `service.rs` | 1 where it is one |
 //! | admin task | `/livez`, `/readyz`, `/metrics`, `/v1/…` | 1 and one per connection |
@@ -43,6 +43,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use blaze_brokers::{Broker, BrokerKind};
+use blaze_domain::node_file::Ros2Plugin;
 use blaze_domain::{FlowId, Priority, Scope};
 use blaze_proto::link::link_control::{Egress as SaidEgress, LayerScope};
 use blaze_runtime::admin::{AdminServer, CheckStatus, Readiness};
@@ -56,6 +57,7 @@ use crate::lane::core::{DataConfig, DataCore};
 use crate::limit::limiter::Limiter;
 use crate::link::{Engine, EngineConfig, Limits, NameConflict};
 use crate::registry::{LayerNames, peers_channel};
+use crate::types::{Types, built_in_for};
 use crate::world::LayerScopeId;
 use control_task::Leave;
 pub use epochs::Epochs;
@@ -106,6 +108,8 @@ pub(crate) struct Shared {
     pub(crate) ros2: Option<Ros2Scope>,
     pub(crate) egress: Arc<Egress>,
     pub(crate) limiter: Mutex<Limiter>,
+    /// ROS 2 types, for conversions.
+    pub(crate) types: Arc<Types>,
     pub(crate) live: Mutex<LiveSettings>,
     pub(crate) readiness: Readiness,
     /// Whether the control channels of node and layer are read.
@@ -203,12 +207,14 @@ pub async fn start_with(
     let said_layer_scope = said_layer_scope(layer.as_ref());
     let layer_kind = layer.as_ref().map(|layer| layer.broker.kind());
 
-    let core = DataCore::new(DataConfig {
+    let types = Arc::new(types_of(settings.ros2.as_ref()));
+    let mut core = DataCore::new(DataConfig {
         me: settings.me.clone(),
         epoch,
         large_bytes: settings.live.bandwidth.large_bytes.into(),
         salt: rand::random(),
     });
+    core.set_types(Arc::clone(&types));
     let engine = settings.inter.as_ref().map(|inter| {
         let config = EngineConfig {
             me: settings.me.clone(),
@@ -278,6 +284,7 @@ pub async fn start_with(
         ros2,
         egress,
         limiter: Mutex::new(Limiter::new(settings.live.bandwidth.clone())),
+        types,
         live: Mutex::new(settings.live),
         readiness: readiness.clone(),
         hears: Default::default(),
@@ -287,9 +294,7 @@ pub async fn start_with(
     let live = shared.live.lock().clone();
     shared.set_bandwidth(now, &live.bandwidth);
     shared.plane.read(|state| state.core.set_compression(live.compression.clone()));
-    if shared.inter.is_some() {
-        start_pool(&shared.plane, live.pool_threads, &supervisor)?;
-    }
+    start_pool(&shared.plane, live.pool_threads, &supervisor)?;
     let metrics_of = Arc::clone(&shared);
     let admin = AdminServer::bind(
         settings.admin,
@@ -371,6 +376,8 @@ impl RunningFlow {
         if let (Some(ros2), Some(rules)) = (&self.shared.ros2, &live.ros2) {
             ros2.set_rules(rules);
         }
+        let folders = live.ros2.as_ref().map(|ros2| ros2.interfaces.clone());
+        self.shared.types.set_folders(folders.unwrap_or_default());
         *self.shared.live.lock() = live;
     }
 
@@ -427,7 +434,14 @@ impl RunningFlow {
     }
 }
 
-/// Starts the threads that compress. They end when the flow has drained, or with the process if it
+/// The types that are built in for the release of the node file, and its folders.
+fn types_of(ros2: Option<&Ros2Plugin>) -> Types {
+    ros2.map_or_else(Types::default, |plugin| {
+        Types::new(built_in_for(plugin.distro), plugin.live.interfaces.clone())
+    })
+}
+
+/// Starts the threads that compress and convert. They end when the flow has drained, or with the process if it
 /// does not.
 fn start_pool(plane: &Arc<Plane>, threads: u16, supervisor: &Supervisor) -> anyhow::Result<()> {
     let of_threads = supervisor.clone();

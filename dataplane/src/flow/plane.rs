@@ -161,7 +161,7 @@ impl PlaneState {
 }
 
 /// What a thread does with a payload.
-type Run = fn(Work, &[u8]) -> Done;
+type Run = fn(&Work, &[u8]) -> Done;
 
 /// The threads that compress.
 struct Codec {
@@ -274,7 +274,7 @@ impl Plane {
         };
         let (job, mut requests) = self.locked(begin);
         if let Some(CodecJob { ticket, payload, work }) = job {
-            let done = guarded(|| (codec.run)(work, &payload));
+            let done = guarded(|| (codec.run)(&work, &payload));
             let ((), more) = self.locked(|state| state.finished(Instant::now(), ticket, done));
             requests += more;
         }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::extract::{Query, State};
 use axum::http::StatusCode;
@@ -24,6 +25,8 @@ use crate::why::{
     WhyTarget, explain,
 };
 
+/// How long a message that could not be converted is shown.
+const SHOWN: Duration = Duration::from_secs(10);
 /// Lapsed leases that are looked at.
 const MAX_HINTS: usize = 16;
 
@@ -142,6 +145,11 @@ fn facts_of(bridge: &mut Bridge) -> BridgeFacts {
         dropped: lately.dropped.into_iter().collect(),
         exceeds_advertised: bridge.exceeds_advertised,
         denied: 0,
+        unconverted: bridge
+            .unconverted
+            .as_ref()
+            .filter(|last| last.at.elapsed() < SHOWN)
+            .map(|last| (last.failure.code, last.failure.detail.clone())),
     }
 }
 

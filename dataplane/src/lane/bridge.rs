@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use blaze_brokers::PublishOutcome;
 use blaze_domain::{DropReason, FlowId, Priority, Scope};
+use blaze_proto::Frame;
 
 use super::admit::Admitted;
 use super::allocation::LaneGates;
@@ -19,6 +20,7 @@ use super::writer::{NewWriter, Writer};
 use crate::limit::gate::Gate;
 use crate::link::{StreamKey, Submit};
 use crate::plan::{Bridge, Target};
+use crate::types::Encoding;
 
 /// Replaced writers of a bridge that may still have something to deliver.
 const MAX_PAST: usize = 4;
@@ -27,6 +29,15 @@ const MAX_PAST: usize = 4;
 /// images at 16 Hz. Slower topics, whose images take longer than that, keep no more than the
 /// newest.
 const SLACK: Duration = Duration::from_millis(125);
+
+/// What a bridge has admitted and not written.
+#[expect(clippy::large_enum_variant, reason = "it is taken apart at once, and a box costs more")]
+pub(super) enum Passed {
+    /// For its lane.
+    ToLane(Waiting),
+    /// For its broker, in this encoding and until then.
+    ToConvert { to: Encoding, deadline: Option<Instant> },
+}
 
 impl BridgeState {
     pub(super) fn new(now: Instant, planned: &Bridge, sink: Sink) -> Self {
@@ -45,6 +56,7 @@ impl BridgeState {
             submitted: false,
             held: None,
             unwritten: None,
+            unconverted: None,
             stats: BridgeStats::default(),
             out_rate: RateMeter::new(now),
             load: LoadMeter::new(now),
@@ -185,14 +197,14 @@ impl BridgeState {
     }
 
     /// Takes a message that it wants: filters, counts, and writes it to a broker. Returns what is
-    /// to go to its lane, if it has one.
+    /// to go to its lane, or to be written in another encoding.
     pub(super) fn pass(
         &mut self,
         now: Instant,
         message: &Admitted,
         large: bool,
         gates: &mut LaneGates,
-    ) -> Option<Waiting> {
+    ) -> Option<Passed> {
         if let Phase::Draining { until, latest } = &mut self.phase {
             *until = (*until).max(now + DRAIN).min(*latest);
         }
@@ -217,38 +229,48 @@ impl BridgeState {
             self.stats.dropped.add(reason, 1);
             return None;
         }
-        match &mut self.sink {
-            // Nothing here makes JSON of another encoding.
-            Sink::Publish { .. } if self.target.is_json() && !is_json(frame.encoding()) => {
-                self.stats.dropped.add(DropReason::ConvertError, 1);
-                None
-            }
-            Sink::Publish { writer, bare, .. } => {
-                let Some(writer) = writer else {
-                    self.stats.dropped.add(DropReason::BrokerError, 1);
-                    return None;
-                };
+        match &self.sink {
+            Sink::Publish { .. } => {
                 let deadline = (lifespan_ms > 0).then(|| {
                     now + Duration::from_millis(lifespan_ms.into())
                         - Duration::from_micros(message.age_us)
                 });
-                match writer.publish(frame, *bare, deadline) {
-                    PublishOutcome::Taken => {
-                        self.stats.latency.record(message.here_us);
-                        self.out_rate.add(now, bytes);
-                    }
-                    PublishOutcome::Dropped => self.stats.dropped.add(DropReason::BrokerError, 1),
-                    PublishOutcome::TooLarge => self.stats.dropped.add(DropReason::TooLarge, 1),
+                if let Some(to) = self.encoding() {
+                    return Some(Passed::ToConvert { to, deadline });
                 }
+                self.write(now, frame, message.here_us, deadline);
                 None
             }
-            Sink::Lane { .. } => Some(Waiting {
+            Sink::Lane { .. } => Some(Passed::ToLane(Waiting {
                 large,
                 bytes,
                 frame: frame.clone().with_hops_and_age(message.hops, message.age_us),
                 arrived: now,
                 lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
-            }),
+            })),
+        }
+    }
+
+    /// Hands a message to the broker. `here_us`: since it came to this flow.
+    pub(super) fn write(
+        &mut self,
+        now: Instant,
+        frame: &Frame,
+        here_us: u64,
+        deadline: Option<Instant>,
+    ) {
+        let Sink::Publish { writer, bare, .. } = &mut self.sink else { return };
+        let Some(writer) = writer else {
+            self.stats.dropped.add(DropReason::BrokerError, 1);
+            return;
+        };
+        match writer.publish(frame, *bare, deadline) {
+            PublishOutcome::Taken => {
+                self.stats.latency.record(here_us);
+                self.out_rate.add(now, frame.payload().len() as u64);
+            }
+            PublishOutcome::Dropped => self.stats.dropped.add(DropReason::BrokerError, 1),
+            PublishOutcome::TooLarge => self.stats.dropped.add(DropReason::TooLarge, 1),
         }
     }
 
@@ -350,10 +372,4 @@ impl BridgeState {
         let within_slack = (self.allocated_hz.unwrap_or(0.0) * SLACK.as_secs_f64()) as usize;
         within_slack.max(self.lane.depth as usize).max(1)
     }
-}
-
-/// Whether a media type is JSON.
-fn is_json(encoding: &str) -> bool {
-    let essence = encoding.split(';').next().unwrap_or_default().trim();
-    essence.eq_ignore_ascii_case("application/json")
 }

@@ -4,6 +4,7 @@
 //! ```text
 //! gate ─► outward: a place in the line of topic and writer ─► begin ─► LZ4 ─► finished ─► in order ─► lanes
 //! link ─► inward:  a place in the line of topic and writer ─► begin ─► LZ4 ─► finished ─► in order ─► bridges to brokers
+//! gate ─► convert: a place in the line of topic, writer and encoding ─► begin ─► types ─► finished ─► in order ─► brokers
 //! ```
 //!
 //! A message is compressed once, whatever the number of its lanes. What needs no compression waits
@@ -14,6 +15,7 @@
 //! and [`DataCore::finished`] with the result. A message that no thread has started may still be
 //! replaced by a newer one or expire.
 
+mod convert;
 mod inward;
 mod level;
 mod outward;
@@ -30,9 +32,13 @@ use super::admit::Admitted;
 use super::core::{DataCore, LaneLink};
 use super::path::TopicId;
 use crate::codec::effort::shares;
-use crate::codec::order::{Bounds, InOrder, Ticket};
+use crate::codec::order::{Bounds, InOrder, Ticket, Waiting};
 use crate::codec::pool::{Urgency, threads_for_long};
 use crate::codec::{Done, Work};
+use crate::types::Encoding;
+use convert::Converting;
+pub(super) use convert::ToBrokers;
+pub use convert::{ConvertStats, Unconverted};
 pub(super) use inward::plain;
 pub use level::{CompressStats, TopicEffort};
 use outward::Outward;
@@ -105,8 +111,22 @@ pub struct CodecJob {
 /// Which message that is.
 #[derive(Debug, Clone, Copy)]
 pub struct CodecTicket {
-    place: Ticket<TopicId, WriterId>,
-    outward: bool,
+    place: Place,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Place {
+    Out(Ticket<TopicId, WriterId>),
+    Into(Ticket<TopicId, WriterId>),
+    Convert(Ticket<TopicId, (WriterId, Encoding)>),
+}
+
+/// Ways through the stage; jobs of one urgency take turns among them, so that none starves another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Way {
+    Into,
+    Out,
+    Convert,
 }
 
 /// What waits for the codec, and what did not get that far.
@@ -129,11 +149,11 @@ pub(super) struct CompressStage {
     rules: CompressionRules,
     out: InOrder<TopicId, WriterId, Outward>,
     into: InOrder<TopicId, WriterId, Box<Admitted>>,
+    convert: InOrder<TopicId, (WriterId, Encoding), Converting>,
     /// Jobs that were requested and have not begun, by urgency.
     requested: [usize; Urgency::ALL.len()],
-    /// The last short job was inbound. Short jobs alternate between both directions, so that
-    /// neither starves the other.
-    last_was_inward: bool,
+    /// The way of the last job, by urgency.
+    last: [Way; Urgency::ALL.len()],
     refused: u64,
     failed: u64,
 }
@@ -148,8 +168,9 @@ impl Default for CompressStage {
             // Inbound messages of a topic get its full byte bound while waiting: the sender has
             // already paced them and decompression is fast.
             into: InOrder::new(Bounds { waiting_of_one: bounds.bytes_of_one, ..bounds }),
+            convert: InOrder::new(bounds),
             requested: [0; Urgency::ALL.len()],
-            last_was_inward: false,
+            last: [Way::Convert; Urgency::ALL.len()],
             refused: 0,
             failed: 0,
         }
@@ -161,18 +182,18 @@ impl CompressStage {
         self.rules.find(topic)
     }
 
-    /// Whether something of a topic that came over the link is not with its bridges yet.
+    /// Whether something of a topic that came over the link may not be with its brokers yet.
     pub(super) fn delays(&self, topic: TopicId) -> bool {
-        self.into.holds(&topic)
+        self.into.holds(&topic) || self.convert.holds(&topic)
     }
 
     pub(super) fn delays_any(&self) -> bool {
-        self.into.held().items > 0
+        self.into.held().items > 0 || self.convert.held().items > 0
     }
 
     /// Whether it holds anything of a topic.
     pub(super) fn holds(&self, topic: TopicId) -> bool {
-        self.out.holds(&topic) || self.into.holds(&topic)
+        self.out.holds(&topic) || self.delays(topic)
     }
 
     /// What it holds for one bridge of a topic goes to another one. Returns how many messages that
@@ -191,11 +212,24 @@ impl CompressStage {
     /// What it holds for one bridge of a topic.
     pub(super) fn frames_for(&self, topic: TopicId, bridge: usize) -> impl Iterator<Item = &Frame> {
         let lanes = self.out.items(topic).flat_map(|out| &out.lanes);
-        lanes.filter(move |(at, _)| *at == bridge).map(|(_, waiting)| &waiting.frame)
+        let sent = lanes.filter(move |(at, _)| *at == bridge).map(|(_, waiting)| &waiting.frame);
+        let of_bridge =
+            move |message: &&Converting| message.bridges.iter().any(|(at, _)| *at == bridge);
+        let written = self.convert.items(topic).filter(of_bridge).map(|message| &message.frame);
+        sent.chain(written)
     }
 
     fn waiting(&self, urgency: Urgency) -> usize {
-        self.out.waits(urgency).items + self.into.waits(urgency).items
+        self.waits(urgency).items
+    }
+
+    fn waits(&self, urgency: Urgency) -> Waiting {
+        let [out, into, convert] =
+            [self.out.waits(urgency), self.into.waits(urgency), self.convert.waits(urgency)];
+        Waiting {
+            items: out.items + into.items + convert.items,
+            bytes: out.bytes + into.bytes + convert.bytes,
+        }
     }
 
     /// Jobs that are still to be requested. A request whose message was replaced is reused for the
@@ -214,11 +248,10 @@ impl CompressStage {
     fn begin_inward(&mut self) -> Option<CodecJob> {
         let (place, message) = self.into.begin(Urgency::Quick)?;
         let job = CodecJob {
-            ticket: CodecTicket { place, outward: false },
+            ticket: CodecTicket { place: Place::Into(place) },
             payload: message.frame.payload().clone(),
             work: Work::Decompress(message.frame.uncompressed_bytes()),
         };
-        self.last_was_inward = true;
         Some(job)
     }
 }
@@ -245,6 +278,12 @@ impl DataCore {
                 self.compress.into.give_up(&place);
                 self.refuse_inward(place.key().0, DropReason::Shutdown);
                 self.flush_in(now, *place.key(), link);
+            }
+            while let Some(place) = self.compress.convert.begin(urgency).map(|(place, _)| place) {
+                if let Some(message) = self.compress.convert.give_up(&place) {
+                    self.refuse_to_convert(place.key().0, &message, DropReason::Shutdown);
+                }
+                self.flush_convert(now, *place.key());
             }
         }
         self.stir();
@@ -283,23 +322,32 @@ impl DataCore {
         link: &mut dyn LaneLink,
     ) -> Option<CodecJob> {
         self.compress.request_starts(urgency);
-        if urgency == Urgency::Quick
-            && !self.compress.last_was_inward
-            && let Some(job) = self.compress.begin_inward()
-        {
-            return Some(job);
+        let ways = match self.compress.last[urgency as usize] {
+            Way::Convert => [Way::Into, Way::Out, Way::Convert],
+            Way::Into => [Way::Out, Way::Convert, Way::Into],
+            Way::Out => [Way::Convert, Way::Into, Way::Out],
+        };
+        for way in ways {
+            let job = match (way, urgency) {
+                (Way::Into, Urgency::Quick) => self.compress.begin_inward(),
+                (Way::Into, Urgency::Long) => None,
+                (Way::Out, _) => self.begin_outward(now, urgency, link),
+                (Way::Convert, _) => self.begin_convert(now, urgency),
+            };
+            if job.is_some() {
+                self.compress.last[urgency as usize] = way;
+                return job;
+            }
         }
-        self.compress.last_was_inward = false;
-        self.begin_outward(now, urgency, link).or_else(|| match urgency {
-            Urgency::Quick => self.compress.begin_inward(),
-            Urgency::Long => None,
-        })
+        None
     }
 
     /// The calling thread takes the next inbound job. `None`: nothing is left to be done.
     pub fn begin_by_caller(&mut self) -> Option<CodecJob> {
         self.compress.request_starts(Urgency::Quick);
-        self.compress.begin_inward()
+        let job = self.compress.begin_inward()?;
+        self.compress.last[Urgency::Quick as usize] = Way::Into;
+        Some(job)
     }
 
     /// Takes the result of a job.
@@ -311,10 +359,10 @@ impl DataCore {
         link: &mut dyn LaneLink,
     ) {
         self.compress.failed += u64::from(done == Done::Failed);
-        if ticket.outward {
-            self.finished_out(now, &ticket.place, done, link);
-        } else {
-            self.finished_in(now, &ticket.place, done, link);
+        match &ticket.place {
+            Place::Out(place) => self.finished_out(now, place, done, link),
+            Place::Into(place) => self.finished_in(now, place, done, link),
+            Place::Convert(place) => self.finished_convert(now, place, done),
         }
         self.stir();
     }
@@ -345,8 +393,7 @@ impl DataCore {
     #[must_use]
     pub fn compress_counters(&self) -> CompressCounters {
         let stage = &self.compress;
-        let waits = Urgency::ALL
-            .map(|urgency| stage.out.waits(urgency).bytes + stage.into.waits(urgency).bytes);
+        let waits = Urgency::ALL.map(|urgency| stage.waits(urgency).bytes);
         CompressCounters {
             waiting: Urgency::ALL.iter().map(|urgency| stage.waiting(*urgency)).sum(),
             waiting_bytes: waits.iter().sum(),

@@ -11,6 +11,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::num::NonZeroUsize;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::Received;
@@ -21,7 +22,8 @@ use lru::LruCache;
 
 use super::admit::{Admitted, Refusal};
 use super::allocation::Reckoned;
-use super::compress_stage::{Arrival, CompressStage, ToLanes};
+use super::bridge::Passed;
+use super::compress_stage::{Arrival, CompressStage, ToBrokers, ToLanes};
 use super::early::Early;
 use super::kept::KeptMessages;
 use super::measure::micros;
@@ -34,6 +36,7 @@ use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
 use crate::link::{Engine, LaneId, PeerState, Submit};
 use crate::plan::Target;
+use crate::types::{ConvertFailure, Encoding, Types};
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
 pub const MAX_WRITERS: usize = 65_536;
@@ -135,8 +138,12 @@ pub struct DataCore {
     pub(super) succession: Succession,
     /// Of transient_local writers, for bridges that begin later.
     pub(super) kept: KeptMessages,
-    /// Compression and decompression.
+    /// Compression, decompression and conversion.
     pub(super) compress: CompressStage,
+    /// Types of ROS 2 for conversions.
+    pub(super) types: Arc<Types>,
+    /// Messages that could not be converted, for events.
+    pub(super) convert_failures: Vec<(TopicName, ConvertFailure)>,
     /// Durable bridges that have just begun: topic and place.
     pub(super) begun: Vec<(TopicId, usize)>,
     /// What could not be attributed to a topic.
@@ -174,6 +181,8 @@ impl DataCore {
             succession: Succession::default(),
             kept: KeptMessages::default(),
             compress: CompressStage::default(),
+            types: Arc::default(),
+            convert_failures: Vec::new(),
             begun: Vec::new(),
             unattributed: Drops::default(),
             leaving: BTreeSet::new(),
@@ -182,6 +191,11 @@ impl DataCore {
             lanes_changed: false,
             evicted_writers: 0,
         }
+    }
+
+    /// Takes the types of the flow. Without this it has those that are built in.
+    pub fn set_types(&mut self, types: Arc<Types>) {
+        self.types = types;
     }
 
     /// All topics, also those that nobody has used for a while.
@@ -439,14 +453,23 @@ impl DataCore {
         let path = &mut self.topics[topic.0 as usize];
         let large = path.is_large(self.config.large_bytes);
         let mut lanes = ToLanes::new();
+        let (mut as_json, mut as_cdr) = (ToBrokers::new(), ToBrokers::new());
         let mut offered = false;
         for (at, bridge) in
             path.bridges.iter_mut().enumerate().filter(|(_, bridge)| bridge.from == from)
         {
             if bridge.takes() && bridge.wants(me, message) && bridge.is_meant(message.meant) {
                 offered |= bridge.lane_id().is_some();
-                let waiting = bridge.pass(now, message, large, &mut path.gates);
-                lanes.extend(waiting.map(|waiting| (at, waiting)));
+                match bridge.pass(now, message, large, &mut path.gates) {
+                    Some(Passed::ToLane(waiting)) => lanes.push((at, waiting)),
+                    Some(Passed::ToConvert { to: Encoding::Json, deadline }) => {
+                        as_json.push((at, deadline));
+                    }
+                    Some(Passed::ToConvert { to: Encoding::Cdr, deadline }) => {
+                        as_cdr.push((at, deadline));
+                    }
+                    None => {}
+                }
             }
         }
         if offered {
@@ -459,6 +482,11 @@ impl DataCore {
         }
         if !lanes.is_empty() {
             self.compress_out(now, topic, &message.frame, lanes, Arrival::Live, link);
+        }
+        for (to, bridges) in [(Encoding::Json, as_json), (Encoding::Cdr, as_cdr)] {
+            if !bridges.is_empty() {
+                self.convert(now, topic, message, to, bridges);
+            }
         }
     }
 }

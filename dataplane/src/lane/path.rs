@@ -10,7 +10,7 @@ use blaze_proto::Frame;
 
 use super::admit::Refusal;
 use super::allocation::{Granted, LaneGates, Published, Told};
-use super::compress_stage::{CompressStats, TopicEffort};
+use super::compress_stage::{CompressStats, ConvertStats, TopicEffort, Unconverted};
 use super::core::FORGET;
 use super::load::LoadMeter;
 use super::measure::RateMeter;
@@ -23,6 +23,7 @@ use crate::limit::size::SizeMeter;
 use crate::link::LaneId;
 use crate::plan::network::Servers;
 use crate::plan::{LaneSpec, Target};
+use crate::types::TopicTypes;
 
 /// A topic, interned: its place in the data plane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -42,6 +43,8 @@ pub struct TopicInfo {
     pub rate_hz: Option<f64>,
     /// Whose messages are taken: the rules of `flow.access`.
     pub access: TopicAccess,
+    /// Its types, for conversions.
+    pub types: TopicTypes,
     /// Where requests may go, if the topic is that of a service's requests.
     pub servers: Servers,
 }
@@ -184,7 +187,7 @@ pub struct BridgeState {
     pub exceeds_advertised: bool,
     /// Where it writes.
     pub sink: Sink,
-    /// Messages that are being compressed, or wait behind such.
+    /// Messages that are being compressed or converted, or wait behind such.
     pub(super) in_codec: u64,
     /// It has given messages to its lane since it last ended.
     pub(super) submitted: bool,
@@ -192,6 +195,8 @@ pub struct BridgeState {
     pub(super) held: Option<Held>,
     /// It drains, and what its receiver got must be written before another one goes on.
     pub(super) unwritten: Option<Unwritten>,
+    /// The last message that could not be converted for it.
+    pub unconverted: Option<Unconverted>,
     /// Counters.
     pub stats: BridgeStats,
     /// Written per second.
@@ -276,6 +281,10 @@ pub struct TopicPath {
     pub effort: TopicEffort,
     /// What compression did.
     pub compress_stats: CompressStats,
+    /// What conversion did.
+    pub convert_stats: ConvertStats,
+    /// When a message that could not be converted was last reported.
+    pub(super) failure_reported: Option<Instant>,
     /// Messages that are worth compressing and that some lane has admitted.
     pub(super) worth_rate: RateMeter,
     /// Largest payload as sent on the inter scope.
@@ -326,6 +335,8 @@ impl TopicPath {
             compression: Compression::default(),
             effort: TopicEffort::default(),
             compress_stats: CompressStats::default(),
+            convert_stats: ConvertStats::default(),
+            failure_reported: None,
             worth_rate: RateMeter::new(now),
             sent_size: SizeMeter::default(),
             sent_level: 0,

@@ -5,7 +5,8 @@ use std::time::Instant;
 
 use blaze_domain::{TopicName, WriterId};
 
-use super::compress_stage::{Arrival, ToLanes};
+use super::bridge::Passed;
+use super::compress_stage::{Arrival, ToBrokers, ToLanes};
 use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
 use super::succession::{Held, LONGEST_WAIT};
@@ -159,18 +160,25 @@ impl DataCore {
                 }
                 // The rules may have changed since it came.
                 if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(me, &message) {
-                    let waiting = bridge.pass(now, &message, large, &mut path.gates);
-                    passed.extend(
-                        waiting.map(|waiting| (message.frame, ToLanes::from_iter([(at, waiting)]))),
-                    );
+                    let way = bridge.pass(now, &message, large, &mut path.gates);
+                    passed.extend(way.map(|way| (message, way)));
                 }
             }
-            for (frame, lanes) in passed {
-                // From the codec it would come back behind what waits.
-                if first_waiting.contains_key(&frame.writer()) {
-                    self.put_to_lanes(now, topic, lanes, link);
-                } else {
-                    self.compress_out(now, topic, &frame, lanes, Arrival::Kept, link);
+            for (message, way) in passed {
+                let frame = &message.frame;
+                match way {
+                    // From the codec it would come back behind what waits.
+                    Passed::ToLane(waiting) if first_waiting.contains_key(&frame.writer()) => {
+                        self.put_to_lanes(now, topic, ToLanes::from_iter([(at, waiting)]), link);
+                    }
+                    Passed::ToLane(waiting) => {
+                        let lanes = ToLanes::from_iter([(at, waiting)]);
+                        self.compress_out(now, topic, frame, lanes, Arrival::Kept, link);
+                    }
+                    Passed::ToConvert { to, deadline } => {
+                        let bridges = ToBrokers::from_iter([(at, deadline)]);
+                        self.convert(now, topic, &message, to, bridges);
+                    }
                 }
             }
             let path = &mut self.topics[topic.0 as usize];

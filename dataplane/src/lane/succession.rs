@@ -255,7 +255,7 @@ impl BridgeState {
         let lane = self.lane_id();
         let queued = match lane {
             Some(lane) => link.queued(lane) + self.in_codec,
-            None => self.settle(),
+            None => self.settle() + self.in_codec,
         };
         // What a bridge from the inter scope has to empty is on its way to it: it stays until the
         // end.

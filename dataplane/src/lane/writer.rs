@@ -69,7 +69,7 @@ impl Writer {
     ) -> PublishOutcome {
         let payload = frame.payload();
         let outcome = if bare {
-            self.made.publisher.publish_bare(payload, deadline)
+            self.made.publisher.publish_copy(frame, deadline)
         } else {
             self.made.publisher.publish(frame, deadline)
         };

@@ -70,6 +70,8 @@ pub struct BridgeFacts {
     /// Messages that the rules of `flow.access` kept from it during the same time; not among those
     /// of `dropped`.
     pub denied: u64,
+    /// Why the last message that could not be converted for it could not, if that was lately.
+    pub unconverted: Option<(WhyCode, String)>,
 }
 
 /// Whether a bridge works.

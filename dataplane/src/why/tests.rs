@@ -59,6 +59,7 @@ impl Setup {
             dropped: BTreeMap::new(),
             exceeds_advertised: false,
             denied: 0,
+            unconverted: None,
         };
         self.bridges = self.plan.bridges.iter().map(up).collect();
     }
@@ -447,6 +448,13 @@ fn rows() -> Vec<Row> {
             => NotFlowing ConvertError Deliver;
         "a conversion that fails": PAIR, |s| s.drops(DropReason::ConvertError, 0)
             => NotFlowing ConvertError Deliver;
+        "no message is converted": PAIR, |s| {
+            s.drops(DropReason::ConvertError, 0);
+            s.bridges[0].unconverted = Some((WhyCode::TypeUnknown, "no definition".to_owned()));
+        } => NotFlowing TypeUnknown Deliver;
+        "the last message was not converted": PAIR,
+            |s| s.bridges[0].unconverted = Some((WhyCode::ConvertError, "/x: no".to_owned()))
+            => Degraded ConvertError Deliver;
         "an endpoint without an address": PAIR,
             |s| s.route("c/b", None, StepKind::Deliver, WhyCode::Unreachable)
             => NotFlowing Unreachable Deliver;

@@ -460,7 +460,21 @@ fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
         );
         found.push((StepKind::Admit, WhyCode::AccessDenied, detail));
     }
-    for (reason, count) in facts.dropped.iter().filter(|(_, count)| **count > 0) {
+    if let Some((code, detail)) = &facts.unconverted {
+        found.push((StepKind::Deliver, *code, detail.clone()));
+    }
+    // That says it better.
+    let is_said = |reason: &DropReason| {
+        let code = facts.unconverted.as_ref().map(|(code, _)| *code);
+        match reason {
+            DropReason::ConvertError => code.is_some(),
+            DropReason::TypeMismatch => code == Some(WhyCode::TypeMismatch),
+            DropReason::TooLarge => code == Some(WhyCode::TooLarge),
+            _ => false,
+        }
+    };
+    let dropped = facts.dropped.iter().filter(|(reason, count)| **count > 0 && !is_said(reason));
+    for (reason, count) in dropped {
         let (step, code) = match reason {
             DropReason::RateLimit if none_passed => (StepKind::Admit, WhyCode::BudgetStarved),
             DropReason::RateLimit => (StepKind::Admit, WhyCode::RateLimited),

@@ -104,17 +104,7 @@ impl Frame {
                 reason: "is not the size of the payload",
             });
         }
-        let header = &self.head[PREFIX_BYTES..];
-        let mut cuts = places(header)?;
-        cuts.sort_by_key(|cut| cut.start);
-        let mut head =
-            begin(header.len() - cuts.iter().map(ExactSizeIterator::len).sum::<usize>())?;
-        let mut from = 0;
-        for cut in cuts.iter().filter(|cut| !cut.is_empty()) {
-            head.put_slice(&header[from..cut.start]);
-            from = cut.end;
-        }
-        head.put_slice(&header[from..]);
+        let head = self.head_without([COMPRESSION_TAG, UNCOMPRESSED_BYTES_TAG], 0)?;
         let frame = self.with_head(head, payload)?;
         if frame.is_compressed() {
             // Each new reading of it would be compressed once more.
@@ -123,7 +113,28 @@ impl Frame {
         Ok(frame)
     }
 
-    fn with_head(&self, head: BytesMut, payload: Bytes) -> Result<Self, FrameError> {
+    /// Prefix and header without the last of each of these fields, with room for more bytes. Of
+    /// several of one kind the last one counts.
+    pub(super) fn head_without<const N: usize>(
+        &self,
+        tags: [u32; N],
+        room: usize,
+    ) -> Result<BytesMut, FrameError> {
+        let header = &self.head[PREFIX_BYTES..];
+        let mut cuts = places(header, tags)?;
+        cuts.sort_by_key(|cut| cut.start);
+        let cut_bytes = cuts.iter().map(ExactSizeIterator::len).sum::<usize>();
+        let mut head = begin(header.len() - cut_bytes + room)?;
+        let mut from = 0;
+        for cut in cuts.iter().filter(|cut| !cut.is_empty()) {
+            head.put_slice(&header[from..cut.start]);
+            from = cut.end;
+        }
+        head.put_slice(&header[from..]);
+        Ok(head)
+    }
+
+    pub(super) fn with_head(&self, head: BytesMut, payload: Bytes) -> Result<Self, FrameError> {
         Ok(Self::from_parts(head.freeze(), payload)?.with_hops_and_age(self.hops, self.age_us))
     }
 }
@@ -141,10 +152,9 @@ fn begin(header_bytes: usize) -> Result<BytesMut, FrameError> {
     Ok(head)
 }
 
-/// Where the last `compression` and the last `uncompressed_bytes` stand; of several the last one
-/// counts, and is the one that [`Frame::compressed`] has added. Empty where there is none.
-fn places(header: &[u8]) -> Result<[Range<usize>; 2], FrameError> {
-    let mut places = [0..0, 0..0];
+/// Where the last field of each tag stands. Empty where there is none.
+fn places<const N: usize>(header: &[u8], tags: [u32; N]) -> Result<[Range<usize>; N], FrameError> {
+    let mut places = std::array::from_fn(|_| 0..0);
     let mut rest = header;
     while !rest.is_empty() {
         let start = header.len() - rest.len();
@@ -152,11 +162,8 @@ fn places(header: &[u8]) -> Result<[Range<usize>; 2], FrameError> {
             decode_key(&mut rest).map_err(|error| FrameError::Header(error.to_string()))?;
         skip_field(wire_type, tag, &mut rest, DecodeContext::default())
             .map_err(|error| FrameError::Header(error.to_string()))?;
-        let place = start..header.len() - rest.len();
-        match tag {
-            COMPRESSION_TAG => places[0] = place,
-            UNCOMPRESSED_BYTES_TAG => places[1] = place,
-            _ => {}
+        if let Some(at) = tags.iter().position(|wanted| *wanted == tag) {
+            places[at] = start..header.len() - rest.len();
         }
     }
     Ok(places)

@@ -189,7 +189,7 @@ fn pictures_cross_the_link_compressed_while_threads_come_and_go() {
 /// The thread goes on, and the picture goes as it is.
 #[test]
 fn a_codec_that_panics_costs_no_message() {
-    fn fails(work: Work, payload: &[u8]) -> Done {
+    fn fails(work: &Work, payload: &[u8]) -> Done {
         assert!(payload[0] != 7, "as it is meant to");
         work.run(payload)
     }
@@ -208,7 +208,7 @@ fn a_codec_that_panics_costs_no_message() {
 #[test]
 fn stopped_with_pictures_that_wait_it_counts_them_and_the_rest_goes_as_it_is() {
     static MAY_END: AtomicBool = AtomicBool::new(false);
-    fn slow(work: Work, payload: &[u8]) -> Done {
+    fn slow(work: &Work, payload: &[u8]) -> Done {
         while !MAY_END.load(Ordering::SeqCst) {
             std::thread::sleep(Duration::from_millis(1));
         }

@@ -79,7 +79,7 @@ impl DataCore {
         };
         let frame = match done {
             Done::Decompressed(payload) => message.frame.decompressed(payload).ok(),
-            Done::Compressed(_) | Done::Refused(_) | Done::Failed => None,
+            _ => None,
         };
         if let Some(frame) = frame {
             let bytes = frame.payload().len();
@@ -130,6 +130,6 @@ pub(in crate::lane) fn plain(frame: &Frame) -> Option<Frame> {
     let work = Work::Decompress(frame.uncompressed_bytes());
     match guarded(|| work.run(frame.payload())) {
         Done::Decompressed(payload) => frame.decompressed(payload).ok(),
-        Done::Compressed(_) | Done::Refused(_) | Done::Failed => None,
+        _ => None,
     }
 }

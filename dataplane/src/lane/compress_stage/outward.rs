@@ -6,7 +6,7 @@ use blaze_domain::{DropReason, WriterId};
 use blaze_proto::Frame;
 use smallvec::SmallVec;
 
-use super::{Arrival, CodecJob, CodecTicket, Line};
+use super::{Arrival, CodecJob, CodecTicket, Line, Place};
 use crate::codec::order::Ticket;
 use crate::codec::pool::Urgency;
 use crate::codec::{Done, Work};
@@ -178,7 +178,7 @@ impl DataCore {
             });
             if let Some((_, waiting)) = out.lanes.first() {
                 return Some(CodecJob {
-                    ticket: CodecTicket { place, outward: true },
+                    ticket: CodecTicket { place: Place::Out(place) },
                     payload: waiting.frame.payload().clone(),
                     work: Work::Compress(out.level),
                 });

@@ -2,6 +2,7 @@
 
 mod allocation;
 mod compress_stage;
+mod convert;
 mod load;
 mod ros2;
 mod succession;
@@ -202,8 +203,11 @@ fn message(origin: [&str; 3], writer: u8, sequence: u64, depth: u32, bytes: usiz
         service: origin[2].into(),
         ..Origin::default()
     };
-    let header =
-        Header { depth, ..Header::new("imu/data", origin, WriterId([writer; 16]), sequence, WALL) };
+    let header = Header {
+        depth,
+        encoding: "application/cdr; type=a/msg/B".into(),
+        ..Header::new("imu/data", origin, WriterId([writer; 16]), sequence, WALL)
+    };
     Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap()
 }
 

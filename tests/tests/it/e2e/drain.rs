@@ -25,7 +25,8 @@ const MESSAGES: usize = 30;
 const BYTES: usize = 10_000;
 const LIMIT_MBPS: f64 = 8.0;
 
-async fn flow(
+/// A flow on the layer broker of a hub and on the inter scope.
+pub(super) async fn flow(
     name: &str,
     kind: LayerKind,
     domain: u16,

@@ -16,7 +16,14 @@ const ALLOWED: &[(&str, &[&str])] = &[
     (
         // A flow is a service of its node, too.
         "blaze-flow",
-        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers", "blaze-sdk"],
+        &[
+            "blaze-domain",
+            "blaze-proto",
+            "blaze-runtime",
+            "blaze-brokers",
+            "blaze-convert",
+            "blaze-sdk",
+        ],
     ),
     ("blaze-worker", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),
     ("blaze-sdk", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),

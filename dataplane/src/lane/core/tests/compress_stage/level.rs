@@ -88,8 +88,8 @@ fn stream(hands: &mut Hands, next: &mut u64, hz: u32, seconds: u32) {
             hands.begin(Urgency::Long);
             match hands.jobs[0].work {
                 Work::Compress(1) => hands.end_as(0, Some(AT_1), 30),
-                work => {
-                    assert_eq!(work, Work::Compress(3));
+                ref work => {
+                    assert!(matches!(work, Work::Compress(3)), "{work:?}");
                     hands.end_as(0, Some(AT_3), 200);
                 }
             }

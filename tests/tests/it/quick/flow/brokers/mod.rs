@@ -2,6 +2,7 @@
 //! writers that fail and messages that are dropped after they were taken.
 
 mod fake;
+mod json;
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;

@@ -500,6 +500,8 @@ impl<'a> Simulation<'a> {
                 | Output::LayerScope { .. }
                 | Output::LayerAway(_)
                 | Output::Ros2(_)
+                | Output::Owned(_)
+                | Output::Show { .. }
                 | Output::Replicas { .. }
                 | Output::Inter { .. }
                 | Output::SaveLease(_)
