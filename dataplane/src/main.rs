@@ -11,6 +11,7 @@ use blaze_brokers::{Broker, Role, open_layer, open_node};
 use blaze_domain::InstanceName;
 use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
 use blaze_flow::flow::node_file::{Followed, follow_node_file, schema};
+use blaze_flow::flow::ros2::this_host;
 use blaze_flow::flow::service::FlowService;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
@@ -192,12 +193,4 @@ fn layer_broker(
         }
     };
     Ok((Some(LayerBroker { broker, id }), prefix))
-}
-
-/// What is the same for all processes that share a loopback interface: the boot of the host and the
-/// network namespace.
-fn this_host() -> String {
-    let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
-    let namespace = std::fs::read_link("/proc/self/ns/net").unwrap_or_default();
-    format!("{}|{}", boot.trim(), namespace.display())
 }

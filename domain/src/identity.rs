@@ -83,6 +83,13 @@ impl FlowId {
     pub fn is_written(&self, text: &str) -> bool {
         text.split_once('/') == Some((self.layer.as_str(), self.node.as_str()))
     }
+
+    /// Full name of its own node on a ROS 2 network, where names have no `-`:
+    /// `/blaze/edge_robot_1` of `edge/robot-1`.
+    #[must_use]
+    pub fn ros2_node(&self) -> String {
+        format!("/blaze/{}_{}", self.layer, self.node).replace('-', "_")
+    }
 }
 
 impl fmt::Display for FlowId {

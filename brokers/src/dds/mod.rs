@@ -42,6 +42,7 @@ pub use reader::{OctetsSink, Reader, Sample, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
 pub use sample::{Cdr, octet_sequence};
 pub use watch::{EndpointWatch, Endpoints, FoundEndpoint};
+pub(crate) use writer::participant_of;
 pub use writer::{EndpointId, Writer, Written};
 
 /// The type of all samples, IDL `sequence<octet>`.

@@ -19,7 +19,7 @@ pub(super) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
 }
 
 /// Whose reader or writer it is.
-pub(super) fn participant_of(endpoint: &EndpointId) -> GuidPrefix {
+pub(crate) fn participant_of(endpoint: &EndpointId) -> GuidPrefix {
     let mut prefix = [0; 12];
     prefix.copy_from_slice(&endpoint[..12]);
     GuidPrefix(prefix)

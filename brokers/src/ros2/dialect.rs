@@ -4,13 +4,13 @@ use std::net::Ipv4Addr;
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Instant;
 
-use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, WriterId};
+use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, ServiceName, WriterId};
 use blaze_proto::{Frame, Header};
 use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use super::Inner;
 use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
-use super::names::{OWN_NAMESPACE, UNKNOWN_SERVICE, node_of_flow, service_of_node, type_of_dds};
+use super::names::type_of_dds;
 use super::network::Knowledge;
 use crate::dds::adapter::{
     Admission, Companion, Dialect, Encoded, NoMessage, Others, Topic, nanos,
@@ -75,7 +75,7 @@ impl Dialect for Ros {
             reader: participant.raw_reader(GRAPH_TOPIC, keep(GRAPHS))?,
             writer: participant.typed_writer(GRAPH_TOPIC, keep(1))?,
             gid: self.gid,
-            node: node_of_flow(self.flow.layer.as_str(), self.flow.node.as_str()),
+            node: self.flow.ros2_node(),
             knowledge: Arc::clone(&self.knowledge),
             told: None,
         }))
@@ -107,23 +107,18 @@ impl Dialect for Ros {
         let sequence =
             u64::try_from(i64::from(sample.sequence_number)).map_err(|_| NoMessage::Malformed)?;
         let written = sample.source_timestamp().map_or(0, nanos);
-        let service = match &writer.node {
-            Some(node) => service_of_node(node),
-            None => UNKNOWN_SERVICE.to_owned(),
-        };
+        let service = ServiceName::of_ros2_node(writer.node.as_deref().unwrap_or_default());
         let origin = Origin {
             layer: self.flow.layer.to_string(),
             node: self.flow.node.to_string(),
-            service,
+            service: service.to_string(),
             instance: "0".to_owned(),
             epoch: 0,
         };
         let header = Header {
             encoding: format!("application/cdr; type={type_name}"),
             type_hash: writer.type_hash.clone().unwrap_or_default(),
-            lifespan_ms: writer.lifespan.map_or(0, |lifespan| {
-                u32::try_from(lifespan.as_millis()).unwrap_or(u32::MAX).max(1)
-            }),
+            lifespan_ms: writer.lifespan_ms(),
             reliable: writer.reliable,
             depth: if writer.durable { KEPT_SAMPLES } else { 0 },
             age_us: age_us(written, nanos(Timestamp::now()), &writer.addresses),
@@ -180,6 +175,7 @@ struct Graph {
     reader: RawReader,
     writer: Writer,
     gid: GidLength,
+    /// Full name of the own node.
     node: String,
     knowledge: Arc<Knowledge>,
     told: Option<ParticipantNodes>,
@@ -201,7 +197,7 @@ impl Companion for Graph {
                 None => others.note_malformed(),
             }
         }
-        self.knowledge.tick(now);
+        self.knowledge.tick(now, own);
         false
     }
 }
@@ -210,8 +206,9 @@ impl Graph {
     /// Tells the own endpoints, if they are others than before.
     fn tell(&mut self, own: GuidPrefix, others: &Others<'_>) {
         let (readers, writers) = others.own_endpoints();
-        let node =
-            Node { namespace: OWN_NAMESPACE.to_owned(), name: self.node.clone(), readers, writers };
+        let Some((namespace, name)) = self.node.rsplit_once('/') else { return };
+        let (namespace, name) = (namespace.to_owned(), name.to_owned());
+        let node = Node { namespace, name, readers, writers };
         let mut participant = [0; 16];
         participant[..12].copy_from_slice(&own.0);
         participant[12..].copy_from_slice(&PARTICIPANT);

@@ -122,6 +122,15 @@ impl RosEndpoint {
     }
 }
 
+impl RosEndpoint {
+    /// Its lifespan in whole milliseconds, at least 1; 0 = none.
+    #[must_use]
+    pub fn lifespan_ms(&self) -> u32 {
+        self.lifespan
+            .map_or(0, |lifespan| u32::try_from(lifespan.as_millis()).unwrap_or(u32::MAX).max(1))
+    }
+}
+
 /// The hash in USER_DATA `typehash=RIHS01_<64 hex>;`.
 fn type_hash(user_data: &[u8]) -> Option<String> {
     let text = String::from_utf8_lossy(user_data);

@@ -17,8 +17,9 @@ mod graph;
 pub mod names;
 mod network;
 mod offers;
+mod shown;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
@@ -40,11 +41,13 @@ use dialect::Ros;
 use names::{RosName, type_to_dds};
 use network::Knowledge;
 use offers::{Offer, Offered};
+use shown::AllShown;
 
 pub use dialect::KEPT_SAMPLES;
 pub use endpoint::{RosEndpoint, Vendor};
 pub use graph::GidLength;
 pub use network::{MAX_ENDPOINTS, Network};
+pub use shown::Shown;
 
 /// Where a flow meets ROS 2.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -69,6 +72,8 @@ const PEER_SLOTS: u16 = 32;
 const ANNOUNCE: Duration = Duration::from_secs(2);
 /// Topics that are read or written at once, each.
 const MAX_TOPICS: usize = 4096;
+/// Topics that show though nobody has asked for them.
+pub const MAX_SHOWN: usize = 1000;
 
 /// A participant of a ROS 2 network.
 pub struct Ros2Broker {
@@ -80,8 +85,9 @@ struct Inner {
     adapter: Adapter,
     knowledge: Arc<Knowledge>,
     namespace: String,
-    offers: Mutex<Vec<Weak<Offer>>>,
+    offers: Mutex<BTreeMap<RosName, Vec<Weak<Offer>>>>,
     reads: Mutex<Vec<Read>>,
+    shown: Mutex<AllShown>,
 }
 
 /// A topic that the flow reads.
@@ -127,6 +133,7 @@ impl Ros2Broker {
             namespace: config.namespace,
             offers: Mutex::default(),
             reads: Mutex::default(),
+            shown: Mutex::default(),
         });
         let _ = user.set(Arc::downgrade(&inner));
         Ok(Self { inner })
@@ -150,6 +157,21 @@ impl Ros2Broker {
         self.inner.knowledge.set_owned(owned);
         self.inner.adapter.look_again();
     }
+
+    /// Lets topics show on the network before anybody there asks for them, or no longer. Those with
+    /// names that ROS 2 cannot have are left out. Returns for how many there is no room.
+    pub fn show(&self, topics: impl IntoIterator<Item = (TopicName, Option<Shown>)>) -> usize {
+        let inner = &self.inner;
+        let mut refused = 0;
+        for (topic, wanted) in topics {
+            if let Ok(name) = RosName::of_topic(&topic, &inner.namespace) {
+                let has_room = inner.shown.lock().set(topic, name.clone(), wanted);
+                refused += usize::from(!has_room);
+                inner.follow_shown(&name);
+            }
+        }
+        refused
+    }
 }
 
 #[async_trait]
@@ -171,12 +193,14 @@ impl Broker for Ros2Broker {
     ) -> Result<Arc<dyn Publisher>, BrokerError> {
         let (topic, name) = self.inner.name(channel)?;
         let mut offers = self.inner.offers.lock();
-        offers.retain(|offer| offer.strong_count() > 0);
-        if offers.len() >= MAX_TOPICS {
+        if offers.len() >= MAX_TOPICS && !offers.contains_key(&name) {
             return Err(BrokerError::TooManyChannels(MAX_TOPICS));
         }
         let offer = Arc::new(Offer::new(topic, name, options, Arc::downgrade(&self.inner)));
-        offers.push(Arc::downgrade(&offer));
+        offers.entry(offer.name.clone()).or_default().push(Arc::downgrade(&offer));
+        drop(offers);
+        offer.follow(&self.inner);
+        self.inner.follow_shown(&offer.name);
         Ok(offer)
     }
 
@@ -207,12 +231,35 @@ impl Broker for Ros2Broker {
 impl Inner {
     /// Readers and writers follow the endpoints of others.
     fn follow(&self) {
-        let offers: Vec<Arc<Offer>> = self.offers.lock().iter().filter_map(Weak::upgrade).collect();
+        let offers: Vec<Arc<Offer>> =
+            self.offers.lock().values().flatten().filter_map(Weak::upgrade).collect();
         offers.iter().for_each(|offer| offer.follow(self));
+        let shown = self.shown.lock().names();
+        shown.iter().for_each(|name| self.follow_shown(name));
         self.reads.lock().retain_mut(|read| {
             read.follow(self);
             !read.sender.is_closed()
         });
+    }
+
+    /// What shows of a topic follows the writers that are used.
+    fn follow_shown(&self, name: &RosName) {
+        let offers: Vec<Arc<Offer>> =
+            self.offers.lock().get(name).into_iter().flatten().filter_map(Weak::upgrade).collect();
+        self.shown.lock().follow(self, name, offers.iter().map(Arc::as_ref));
+    }
+
+    /// One of the offers of a topic has gone.
+    fn forget_offer(&self, name: &RosName) {
+        let mut offers = self.offers.lock();
+        if let Some(of_name) = offers.get_mut(name) {
+            of_name.retain(|offer| offer.strong_count() > 0);
+            if of_name.is_empty() {
+                offers.remove(name);
+            }
+        }
+        drop(offers);
+        self.follow_shown(name);
     }
 
     fn name(&self, channel: &ChannelName) -> Result<(TopicName, RosName), BrokerError> {
@@ -242,6 +289,22 @@ impl Inner {
     ) -> Option<TopicPublisher> {
         let topic = dds_topic(name, topic, &type_to_dds(type_name)?, terms);
         self.adapter.publisher(topic, options).ok()
+    }
+
+    /// One that is there to be seen, until others write.
+    fn idle_writer(
+        &self,
+        name: &RosName,
+        topic: &TopicName,
+        type_name: &str,
+        terms: Terms,
+        options: PublisherOptions,
+    ) -> Option<TopicPublisher> {
+        if options.depth == 0 {
+            return self.writer(name, topic, type_name, terms, options);
+        }
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, terms);
+        Some(self.adapter.keeping(topic, options.depth))
     }
 }
 

@@ -10,7 +10,7 @@
 use std::fmt;
 
 use blaze_domain::TopicName;
-use blaze_domain::names::{MAX_NAME_BYTES, NameError};
+use blaze_domain::names::NameError;
 
 /// Last segment of the topic of a service's requests, and of its replies.
 const REQUEST: &str = "_request";
@@ -191,35 +191,6 @@ pub fn type_to_dds(ros: &str) -> Option<String> {
     type_of_dds(&dds).is_some_and(|back| back == ros).then_some(dds)
 }
 
-/// The name under which a node is a service of its flow: `arm-talker-1` of `/arm/Talker_1`.
-#[must_use]
-pub fn service_of_node(full_name: &str) -> String {
-    let mut service = String::new();
-    for c in full_name.chars() {
-        let c = c.to_ascii_lowercase();
-        if c.is_ascii_alphanumeric() {
-            service.push(c);
-        } else if !service.is_empty() && !service.ends_with('-') {
-            service.push('-');
-        }
-    }
-    service.truncate(MAX_NAME_BYTES);
-    service.truncate(service.trim_end_matches('-').len());
-    if service.is_empty() { UNKNOWN_SERVICE.to_owned() } else { service }
-}
-
-/// The service while the node is not known.
-pub const UNKNOWN_SERVICE: &str = "ros2";
-
-/// The name of a flow's own node: `/blaze/edge_robot_1` of layer `edge`, node `robot-1`.
-#[must_use]
-pub fn node_of_flow(layer: &str, node: &str) -> String {
-    format!("{layer}_{node}").replace('-', "_")
-}
-
-/// The namespace of a flow's own node.
-pub const OWN_NAMESPACE: &str = "/blaze";
-
 /// What stays on the network unless `system` is set: logs, events of parameters, and each node's
 /// services for parameters and types.
 #[must_use]
@@ -309,23 +280,6 @@ mod tests {
         for other in ["Imu", "a/msg", "a/msg/B/C", "a/idl/B", "a/msg/", "a b/msg/C"] {
             assert_eq!(type_to_dds(other), None, "{other}");
         }
-    }
-
-    #[test]
-    fn nodes_are_services() {
-        for (node, service) in [
-            ("/arm/Talker_1", "arm-talker-1"),
-            ("/talker", "talker"),
-            ("/__a//b__", "a-b"),
-            ("", UNKNOWN_SERVICE),
-            ("/___", UNKNOWN_SERVICE),
-        ] {
-            assert_eq!(service_of_node(node), service);
-            assert!(service.parse::<blaze_domain::ServiceName>().is_ok(), "{service}");
-        }
-        let long = service_of_node(&format!("/{}/{}", "a".repeat(62), "b".repeat(62)));
-        assert_eq!(long, "a".repeat(62), "a name ends with a letter or digit");
-        assert_eq!(node_of_flow("edge", "robot-1"), "edge_robot_1");
     }
 
     #[test]

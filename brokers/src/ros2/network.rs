@@ -1,7 +1,7 @@
 //! What is known of a ROS 2 network: its endpoints with their nodes, and which writers this flow
 //! takes messages of.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,8 @@ use super::endpoint::RosEndpoint;
 use super::graph::ParticipantNodes;
 use super::names::RosName;
 use crate::dds::adapter::Admission;
-use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix};
+
+use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix, participant_of};
 
 /// Endpoints of others that are looked at; further ones are counted.
 pub const MAX_ENDPOINTS: usize = 10_000;
@@ -24,12 +25,16 @@ const NODE_WAIT: Duration = Duration::from_millis(300);
 /// The endpoints of one network, those of flows left out.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Network {
+    /// The own participant, in its present life.
+    pub own: Option<GuidPrefix>,
     /// By identity.
     pub endpoints: Vec<Arc<RosEndpoint>>,
     /// Endpoints beyond the limit.
     pub refused: usize,
     /// Participants that have them.
     pub participants: usize,
+    /// Full names of the nodes that flows have there.
+    pub flows: BTreeSet<String>,
 }
 
 struct Entry {
@@ -39,7 +44,10 @@ struct Entry {
 
 #[derive(Default)]
 struct State {
+    own: Option<GuidPrefix>,
     endpoints: BTreeMap<EndpointId, Entry>,
+    /// The same by name: readers and writers.
+    by_name: HashMap<RosName, [Vec<Arc<RosEndpoint>>; 2]>,
     refused: usize,
     /// Endpoints of flows.
     marked: HashSet<EndpointId>,
@@ -82,8 +90,13 @@ impl Knowledge {
                 }
             }
         }
-        let State { endpoints, owned, .. } = &mut *state;
+        let State { endpoints, by_name, owned, .. } = &mut *state;
         owned.retain(|id, _| endpoints.contains_key(id));
+        by_name.clear();
+        for Entry { endpoint, .. } in endpoints.values() {
+            let of_name = by_name.entry(endpoint.name.clone()).or_default();
+            of_name[usize::from(endpoint.is_writer)].push(Arc::clone(endpoint));
+        }
         self.publish(&state, now);
     }
 
@@ -105,9 +118,11 @@ impl Knowledge {
         self.publish(&state, now);
     }
 
-    /// Lets those count whose time has come.
-    pub(super) fn tick(&self, now: Instant) {
-        self.publish(&self.state.lock(), now);
+    /// Lets those count whose time has come. `own`: the own participant.
+    pub(super) fn tick(&self, now: Instant, own: GuidPrefix) {
+        let mut state = self.state.lock();
+        state.own = Some(own);
+        self.publish(&state, now);
     }
 
     /// Which writers this flow takes messages of; those of others wait until they are named.
@@ -131,11 +146,12 @@ impl Knowledge {
         self.state.lock().endpoints.get(id).map(|entry| Arc::clone(&entry.endpoint))
     }
 
-    /// The writers or readers of a topic, whether or not they count yet.
+    /// The writers or readers of a topic, whether or not they count yet. Their nodes may not be
+    /// told.
     pub(super) fn endpoints(&self, name: &RosName, writers: bool) -> Vec<Arc<RosEndpoint>> {
         let state = self.state.lock();
-        let all = state.endpoints.values().map(|entry| &entry.endpoint);
-        all.filter(|it| it.is_writer == writers && it.name == *name).cloned().collect()
+        let found = state.by_name.get(name).map(|of_name| &of_name[usize::from(writers)]);
+        found.cloned().unwrap_or_default()
     }
 
     fn publish(&self, state: &State, now: Instant) {
@@ -148,9 +164,12 @@ impl Knowledge {
             .filter(counts)
             .map(|entry| Arc::clone(&entry.endpoint))
             .collect();
-        let participants: HashSet<&[u8]> = endpoints.iter().map(|it| &it.id[..12]).collect();
+        let participants: HashSet<_> = endpoints.iter().map(|it| participant_of(&it.id)).collect();
         let participants = participants.len();
-        let network = Network { endpoints, refused: state.refused, participants };
+        let of_flow = |id: &EndpointId| state.nodes.get(&participant_of(id))?.get(id).cloned();
+        let flows = state.marked.iter().filter_map(of_flow).collect();
+        let (own, refused) = (state.own, state.refused);
+        let network = Network { own, endpoints, refused, participants, flows };
         self.network.send_if_modified(|known| {
             let is_new = **known != network;
             if is_new {
@@ -168,9 +187,7 @@ impl State {
             self.refused += 1;
             return;
         }
-        let mut participant = GuidPrefix([0; 12]);
-        participant.0.copy_from_slice(&endpoint.id[..12]);
-        let nodes = self.nodes.get(&participant);
+        let nodes = self.nodes.get(&participant_of(&endpoint.id));
         endpoint.node = nodes.and_then(|nodes| nodes.get(&endpoint.id)).cloned();
         let since = known.as_ref().map_or(now, |entry| entry.since);
         // What has not changed stays the same, which is quick to compare.
@@ -216,7 +233,7 @@ mod tests {
         knowledge.note_nodes(now, told.participant(), &nodes);
         let a = ("/a".to_owned(), Some("/arm/talker".to_owned()));
         assert_eq!(names(&knowledge), std::slice::from_ref(&a));
-        knowledge.tick(now + NODE_WAIT);
+        knowledge.tick(now + NODE_WAIT, GuidPrefix([9; 12]));
         assert_eq!(names(&knowledge), [a, ("/b".to_owned(), None)]);
         // It was found before, so it need not wait again.
         knowledge.note_endpoints(now + NODE_WAIT, &writers(vec![silent]));
@@ -247,7 +264,7 @@ mod tests {
             one
         });
         knowledge.note_endpoints(now, &writers(crowd.collect()));
-        knowledge.tick(now + NODE_WAIT);
+        knowledge.tick(now + NODE_WAIT, GuidPrefix([9; 12]));
         let network = Arc::clone(&knowledge.subscribe().borrow());
         assert_eq!((network.endpoints.len(), network.refused), (MAX_ENDPOINTS, 7));
     }

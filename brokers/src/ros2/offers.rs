@@ -48,6 +48,8 @@ impl Offered {
 struct Written {
     offered: Offered,
     publisher: TopicPublisher,
+    /// Stands for the writers of single origins until one of them has published.
+    idle: Option<TopicPublisher>,
 }
 
 /// A topic that the flow writes.
@@ -81,11 +83,27 @@ impl Offer {
         }
     }
 
-    /// Replaces the writers that do not offer what readers ask for. The new one stands before the
-    /// old one goes, which delivers what it has taken.
+    /// Whether it writes a type.
+    pub(super) fn writes(&self, type_name: &str) -> bool {
+        self.by_type.lock().contains_key(type_name)
+    }
+
+    /// Makes a writer for each type that readers ask for, and replaces those that do not offer what
+    /// readers ask for. The new one stands before the old one goes, which delivers what it has
+    /// taken.
     pub(super) fn follow(&self, inner: &Inner) {
         let mut replaced = Vec::new();
-        for (type_name, written) in self.by_type.lock().iter_mut() {
+        let mut by_type = self.by_type.lock();
+        for reader in inner.knowledge.endpoints(&self.name, false) {
+            let Some(type_name) = &reader.type_name else { continue };
+            let is_new = !by_type.contains_key(type_name) && !reader.is_keyed;
+            if is_new && by_type.len() < MAX_TYPES {
+                let offered = inner.offered(&self.name, type_name, self.options.reliable);
+                let made = self.make(inner, type_name, offered);
+                by_type.extend(made.map(|made| (type_name.clone(), made)));
+            }
+        }
+        for (type_name, written) in by_type.iter_mut() {
             let offered = inner.offered(&self.name, type_name, self.options.reliable);
             if offered == written.offered {
                 continue;
@@ -94,6 +112,7 @@ impl Offer {
                 replaced.push(std::mem::replace(written, next).publisher);
             }
         }
+        drop(by_type);
         let mut all = self.replaced.lock();
         all.append(&mut replaced);
         let mut before = self.before.lock();
@@ -108,8 +127,12 @@ impl Offer {
 
     fn make(&self, inner: &Inner, type_name: &str, offered: Offered) -> Option<Written> {
         let options = PublisherOptions { reliable: offered.reliable, ..self.options };
-        let publisher = inner.writer(&self.name, &self.topic, type_name, offered.terms, options)?;
-        Some(Written { offered, publisher })
+        let (name, topic, terms) = (&self.name, &self.topic, offered.terms);
+        let publisher = inner.writer(name, topic, type_name, terms, options)?;
+        let idle = (options.depth > 0)
+            .then(|| inner.idle_writer(name, topic, type_name, terms, options))
+            .flatten();
+        Some(Written { offered, publisher, idle })
     }
 
     fn refuse(&self) -> PublishOutcome {
@@ -118,22 +141,33 @@ impl Offer {
     }
 }
 
+impl Drop for Offer {
+    fn drop(&mut self) {
+        if let Some(inner) = self.inner.upgrade() {
+            inner.forget_offer(&self.name);
+        }
+    }
+}
+
 impl Publisher for Offer {
     /// Writes a message of ROS 2 in its own type; another one is dropped.
     fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
         let Some(type_name) = type_of(frame.encoding()) else { return self.refuse() };
         let mut by_type = self.by_type.lock();
-        if let Some(written) = by_type.get(type_name) {
-            return written.publisher.publish(frame, deadline);
+        if let Some(written) = by_type.get_mut(type_name) {
+            let outcome = written.publisher.publish(frame, deadline);
+            written.idle = None;
+            return outcome;
         }
         let Some(inner) = self.inner.upgrade() else { return PublishOutcome::Dropped };
         let offered = inner.offered(&self.name, type_name, self.options.reliable);
         let made = self.make(&inner, type_name, offered).filter(|_| by_type.len() < MAX_TYPES);
-        let Some(made) = made else {
+        let Some(mut made) = made else {
             drop(by_type);
             return self.refuse();
         };
         let outcome = made.publisher.publish(frame, deadline);
+        made.idle = None;
         by_type.insert(type_name.to_owned(), made);
         outcome
     }

@@ -280,6 +280,7 @@ impl ControlCore {
         let changed = self.registry.watch_flows(now);
         self.touch(now, changed);
         self.follow_ros2(now);
+        self.tell_owned();
         self.hurry(now);
         if now.saturating_duration_since(self.reconciled) >= RECONCILE {
             self.reconciled = now;

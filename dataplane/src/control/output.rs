@@ -1,11 +1,11 @@
 //! What a control core is told at its start, and what it wants done.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::{AccessRules, AutoBool};
-use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
+use blaze_domain::{FlowId, LayerKind, Scope, TopicName, WriterId};
 use blaze_proto::link::link_control::{Body, LayerScope};
 use bytes::Bytes;
 
@@ -13,6 +13,7 @@ use bytes::Bytes;
 use super::ControlCore;
 use super::Duty;
 use crate::lane::path::TopicInfo;
+use crate::plan::network::Shown;
 use crate::plan::{PlanRules, TopicPlan};
 use crate::registry::{LayerNames, UnsavedLease};
 use crate::world::{FlowState, LayerScopeId, OriginFilter, Ros2Network};
@@ -79,6 +80,15 @@ pub enum Output {
     LayerAway(bool),
     /// Say in Hello on which ROS 2 network this flow is.
     Ros2(Option<Ros2Network>),
+    /// Read the writers of the ROS 2 network that are this flow's, and not those of others.
+    Owned(BTreeMap<WriterId, bool>),
+    /// Let what other flows offer of a topic show on the ROS 2 network, or no longer.
+    Show {
+        /// The topic.
+        topic: TopicName,
+        /// What is offered.
+        shown: Option<Shown>,
+    },
     /// Let the broker of a scope keep or forget a lease.
     SaveLease(UnsavedLease),
     /// Forget what is kept of writers for late joiners: their service no longer advertises the

@@ -9,6 +9,7 @@ use blaze_domain::control::EventKind;
 use super::info::{Sources, announced_bytes, durable_sources, local_info};
 use super::routes::route_states;
 use super::{ControlCore, LATEST, Output, QUIET, event};
+use crate::plan::network::{self, Shown};
 use crate::plan::{Survey, TopicPlan, plan_within};
 use crate::registry::{MAX_ROUTES, carrying_states};
 use crate::world::OriginFilter;
@@ -25,6 +26,8 @@ struct Draft {
     max_bytes: Option<u64>,
     /// Some flow announces something of the topic.
     is_known: bool,
+    /// How it shows on the own ROS 2 network.
+    shown: Option<Shown>,
 }
 
 pub(super) struct Dirty {
@@ -99,14 +102,16 @@ impl ControlCore {
                 durable: durable_sources(&holders, topic),
                 max_bytes: announced_bytes(&holders, topic),
                 is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
+                shown: network::shown(&survey, topic),
             }
         };
         topics.iter().map(draft).collect()
     }
 
     fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
+        let Draft { mut plan, durable, max_bytes, is_known, shown } = draft;
+        self.show(topic, shown);
         let previous = self.plans.get(topic);
-        let Draft { mut plan, durable, max_bytes, is_known } = draft;
         if is_known
             && previous == Some(&plan)
             && plan.bridges.is_empty()

@@ -61,6 +61,7 @@ impl Scopes {
 impl ControlCore {
     /// The broker of a local scope has changed.
     pub fn set_scope_health(&mut self, now: Instant, scope: Scope, health: ScopeHealth) {
+        let health = if scope == Scope::Ros2 { self.ros2_health(health) } else { health };
         let before = self.scopes.health(scope);
         if before == health {
             return;

@@ -240,6 +240,16 @@ impl ControlTask {
             Output::Ros2(network) => {
                 plane.link(|engine| engine.set_ros2(now, network));
             }
+            Output::Owned(owned) => {
+                if let Some(ros2) = &self.shared.ros2 {
+                    ros2.set_owned(owned);
+                }
+            }
+            Output::Show { topic, shown } => {
+                if let Some(ros2) = &self.shared.ros2 {
+                    ros2.show(topic, shown);
+                }
+            }
             Output::LayerScope { shared } => {
                 let said = if shared { self.shared.layer_scope } else { (LayerScope::None, 0) };
                 plane.link(|engine| engine.set_layer_scope(now, said.0, said.1));

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::Health;
+use blaze_brokers::{Broker as _, Health};
 use blaze_domain::Scope;
 use blaze_runtime::admin::{CheckStatus, Gate, Readiness};
 use blaze_runtime::{BEAT, ticks};
@@ -13,6 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::inter::InterScope;
 use super::plane::wall_ms;
+use super::ros2::Ros2Scope;
 use super::{LocalBrokers, Shared};
 use crate::control::Stage;
 use crate::link::{Engine, MAX_PEERS, NameConflict};
@@ -29,6 +30,7 @@ pub(super) fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
     let there = [
         ("node_broker", brokers.node.is_some()),
         ("layer_broker", brokers.layer.is_some()),
+        ("ros2", brokers.ros2.is_some()),
         ("inter", inter),
     ];
     for (check, _) in there.into_iter().filter(|(_, there)| *there) {
@@ -81,6 +83,10 @@ pub(super) async fn watch_health(
             };
             shared.readiness.set(check, state, detail);
         }
+        if let Some(ros2) = &shared.ros2 {
+            let (state, detail) = ros2_check(&shared, ros2);
+            shared.readiness.set("ros2", state, detail);
+        }
         show_conflicts(&shared, &mut conflicts);
         if in_doubt && wall_ms() > shared.epoch.load(Ordering::Relaxed) {
             // The next life has another epoch, whether this one is kept or not.
@@ -123,6 +129,16 @@ fn with_refused(shared: &Shared, detail: String) -> String {
     }
     let refused = format!("{waiting} more flows are not reached: {MAX_PEERS} peers are the most");
     if detail.is_empty() { refused } else { format!("{detail}; {refused}") }
+}
+
+/// Whether the ROS 2 network can be used, and belongs to this layer.
+fn ros2_check(shared: &Shared, ros2: &Ros2Scope) -> (CheckStatus, String) {
+    if let Some(detail) = ros2.in_use(&shared.control.lock()) {
+        return (CheckStatus::Failed, detail);
+    }
+    let status = ros2.broker.status().borrow().clone();
+    let is_up = status.health == Health::Up;
+    (if is_up { CheckStatus::Ok } else { CheckStatus::Failed }, status.detail)
 }
 
 /// Whether flows of other groups are reached, on the inter scope or over a gateway.

@@ -5,6 +5,7 @@
 //! |---|---|---|
 //! | control task | control channels, link news → control core → answers, plans | 1 |
 //! | scope task | health of a local broker, the leases that it keeps → control core | per local scope |
+//! | network task | endpoints of a ROS 2 network → control core | 1 where there is one |
 //! | peers task | who else uses the layer broker, and what they say | 1 where there is one |
 //! | source task | one topic of one local scope → message path | per topic and scope that is read |
 //! | inter thread | joins and leaves the inter scope, as the control core wants | 1 where there is one |
@@ -26,6 +27,7 @@ pub mod node_file;
 pub mod pacing;
 mod peers_task;
 pub mod plane;
+pub mod ros2;
 mod routes;
 mod scope_task;
 pub mod service;
@@ -62,6 +64,7 @@ use inter::InterScope;
 use pacing::Egress;
 use peers_task::PeersTask;
 use plane::{Plane, wall_ms, wall_ns};
+use ros2::Ros2Scope;
 pub use routes::LocalBrokers;
 use routes::Routes;
 use scope_task::ScopeTask;
@@ -100,6 +103,7 @@ pub(crate) struct Shared {
     pub(crate) routes: Routes,
     pub(crate) brokers: LocalBrokers,
     pub(crate) inter: Option<InterScope>,
+    pub(crate) ros2: Option<Ros2Scope>,
     pub(crate) egress: Arc<Egress>,
     pub(crate) limiter: Mutex<Limiter>,
     pub(crate) live: Mutex<LiveSettings>,
@@ -217,7 +221,13 @@ pub async fn start_with(
         Engine::new(config, now, wall_ns())
     });
     let plane = Plane::new(core, engine);
-    let brokers = LocalBrokers { node, layer: layer.map(|layer| layer.broker) };
+    let ros2 =
+        settings.ros2.as_ref().map(|plugin| Ros2Scope::open(&settings.me, plugin)).transpose()?;
+    let brokers = LocalBrokers {
+        node,
+        layer: layer.map(|layer| layer.broker),
+        ros2: ros2.as_ref().map(|ros2| Arc::clone(&ros2.broker) as _),
+    };
     let config = ControlConfig {
         me: settings.me.clone(),
         kind: settings.kind,
@@ -265,6 +275,7 @@ pub async fn start_with(
         control: Mutex::new(control),
         brokers,
         inter,
+        ros2,
         egress,
         limiter: Mutex::new(Limiter::new(settings.live.bandwidth.clone())),
         live: Mutex::new(settings.live),
@@ -302,6 +313,10 @@ pub async fn start_with(
     };
     let control = supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
     watch_brokers(&shared, &supervisor, epoch);
+    if shared.ros2.is_some() {
+        let follow = ros2::follow_network(Arc::clone(&shared), supervisor.shutdown_token());
+        supervisor.spawn("network", TaskPolicy::Essential, follow);
+    }
     supervisor.spawn(
         "health",
         TaskPolicy::Essential,
@@ -353,6 +368,9 @@ impl RunningFlow {
             control.set_rules(now, live.rules.clone());
             control.set_access(now, wall_ms(), live.access.clone());
         }
+        if let (Some(ros2), Some(rules)) = (&self.shared.ros2, &live.ros2) {
+            ros2.set_rules(rules);
+        }
         *self.shared.live.lock() = live;
     }
 
@@ -384,7 +402,7 @@ impl RunningFlow {
             }
         }
         shared.routes.stop();
-        let brokers = [&shared.brokers.node, &shared.brokers.layer];
+        let brokers = Scope::LOCAL.map(|scope| shared.brokers.of(scope));
         let closed_by = tokio::time::Instant::now() + CLOSE;
         for broker in brokers.into_iter().flatten() {
             if tokio::time::timeout_at(closed_by, broker.close()).await.is_err() {

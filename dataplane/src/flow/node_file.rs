@@ -134,7 +134,7 @@ pub fn follow_node_file(
     let flow = Arc::clone(flow);
     let take = move |loaded: &Loaded<NodeFile>| {
         let file = &loaded.value;
-        flow.reload(LiveSettings::from(&file.flow));
+        flow.reload(LiveSettings::from(file));
         if let Some(Err(error)) = log.as_ref().map(|log| log.set_level(&file.log.level)) {
             tracing::error!(%error, "log.level");
         }

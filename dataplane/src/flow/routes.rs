@@ -29,6 +29,8 @@ pub struct LocalBrokers {
     pub node: Option<Arc<dyn Broker>>,
     /// Layer scope.
     pub layer: Option<Arc<dyn Broker>>,
+    /// ROS 2 network.
+    pub ros2: Option<Arc<dyn Broker>>,
 }
 
 impl LocalBrokers {
@@ -38,7 +40,8 @@ impl LocalBrokers {
         match scope {
             Scope::Node => self.node.as_ref(),
             Scope::Layer => self.layer.as_ref(),
-            Scope::Ros2 | Scope::Inter => None,
+            Scope::Ros2 => self.ros2.as_ref(),
+            Scope::Inter => None,
         }
     }
 

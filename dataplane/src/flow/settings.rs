@@ -3,7 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 
 use blaze_domain::node_file::{
-    AccessRules, AutoBool, BandwidthSection, Chunking, FlowSection, NodeFile,
+    AccessRules, AutoBool, BandwidthSection, Chunking, FlowSection, NodeFile, Ros2Live, Ros2Plugin,
 };
 use blaze_domain::{FlowId, LayerKind};
 
@@ -41,6 +41,8 @@ pub struct LiveSettings {
     pub rules: PlanRules,
     /// Who may advertise and request what.
     pub access: AccessRules,
+    /// What of the ROS 2 network is bridged.
+    pub ros2: Option<Ros2Live>,
 }
 
 impl From<&FlowSection> for LiveSettings {
@@ -51,7 +53,15 @@ impl From<&FlowSection> for LiveSettings {
             pool_threads: flow.pool_threads,
             rules: PlanRules { topics: flow.topics.clone() },
             access: flow.access.clone(),
+            ros2: None,
         }
+    }
+}
+
+impl From<&NodeFile> for LiveSettings {
+    fn from(file: &NodeFile) -> Self {
+        let ros2 = file.brokers.ros2.as_ref().map(|plugin| plugin.live.clone());
+        Self { ros2, ..Self::from(&file.flow) }
     }
 }
 
@@ -66,6 +76,8 @@ pub struct FlowSettings {
     pub admin: SocketAddr,
     /// The inter scope, if the node has one.
     pub inter: Option<InterSettings>,
+    /// The ROS 2 network, if the node has one.
+    pub ros2: Option<Ros2Plugin>,
     /// Whether it is on the inter scope for the flows that share its layer broker.
     pub gateway: AutoBool,
     /// What may change.
@@ -96,8 +108,9 @@ impl TryFrom<&NodeFile> for FlowSettings {
             kind: layer.kind,
             admin: file.admin.flow,
             inter,
+            ros2: file.brokers.ros2.clone(),
             gateway: file.flow.gateway,
-            live: LiveSettings::from(&file.flow),
+            live: LiveSettings::from(file),
         })
     }
 }

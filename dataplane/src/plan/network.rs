@@ -14,10 +14,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::Ipv4Addr;
 
-use blaze_domain::{FlowId, LayerName, Scope, TopicName, WriterId};
+use blaze_domain::{Durability, FlowId, LayerName, Reliability, Scope, TopicName, WriterId};
 
-use super::rendezvous;
-use crate::world::{FlowView, Reach, Ros2Network, Ros2NetworkId, World};
+use super::told::merge_offers;
+use super::{Survey, rendezvous};
+use crate::world::{Advertise, FlowView, Reach, Ros2Network, Ros2NetworkId, TopicEntry, World};
 
 /// The flows of a layer on one ROS 2 network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -93,6 +94,43 @@ pub fn is_of_service(topic: &TopicName) -> bool {
     topic.as_str().rsplit('/').next().is_some_and(|last| matches!(last, "_request" | "_reply"))
 }
 
+/// What shows of a topic on a network before anybody there asks for it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Shown {
+    /// ROS type, such as `sensor_msgs/msg/Imu`.
+    pub type_name: String,
+    /// As it is offered.
+    pub reliability: Reliability,
+    /// As it is offered.
+    pub durability: Durability,
+}
+
+/// What the own flow shows of a topic on its network: what is offered elsewhere in one ROS type, or
+/// on its own node.
+pub(crate) fn shown(survey: &Survey<'_>, topic: &TopicName) -> Option<Shown> {
+    let world = survey.world;
+    let (me, own) = world.flows.get_key_value(&world.me)?;
+    let network = Network::of(me, own).filter(|_| world.carries(me) && !is_of_service(topic))?;
+    let is_own = |id: &FlowId, scope| id == me && scope == Scope::Node;
+    let writes_others = || writer(&survey.networks, network, topic) == Some(me);
+    // What flows of the network offer on their nodes, each of them shows itself.
+    let is_of_others = |id: &FlowId, flow: &FlowView, scope| {
+        let on_network = Network::of(id, flow) == Some(network);
+        !on_network || matches!(scope, Scope::Layer | Scope::Inter)
+    };
+    let holders = survey.holders(topic).into_iter().filter(|(id, _)| world.carries(id));
+    let offers = holders.flat_map(|(id, flow)| {
+        let entries = flow.topics.get(topic).map(TopicEntry::scopes).into_iter().flatten();
+        entries.filter_map(move |(scope, entry)| Some((id, flow, scope, entry.advertise.as_ref()?)))
+    });
+    let shown = offers.filter(|(id, flow, scope, _)| {
+        is_own(id, *scope) || (is_of_others(id, flow, *scope) && writes_others())
+    });
+    let offer = merge_offers(shown.map(|(.., offer)| offer))?;
+    let Advertise { type_name, reliability, durability, .. } = offer;
+    (!type_name.is_empty()).then_some(Shown { type_name, reliability, durability })
+}
+
 /// A flow that could own a writer of its network.
 pub type Candidate = (FlowId, Ipv4Addr);
 
@@ -126,17 +164,18 @@ pub fn heir(candidates: &[Candidate], guid: WriterId) -> Option<&FlowId> {
 }
 
 /// The flow of another layer that the own flow has to leave its network to, if any: one with a
-/// smaller epoch, or the same and a smaller name. `network`: where the own flow would be. `found`:
-/// flows whose participants were found on it.
+/// smaller epoch, or the same and a smaller name. `network`: where the own flow would be. `nodes`:
+/// those of flows that were found on it.
 #[must_use]
 pub fn holder<'w>(
     world: &'w World,
     network: Ros2Network,
-    found: &BTreeSet<FlowId>,
+    nodes: &BTreeSet<String>,
 ) -> Option<&'w FlowId> {
     let own = world.own()?;
     let is_there = |id: &FlowId, flow: &FlowView| {
-        flow.ros2.is_some_and(|other| other.id == network.id || found.contains(id))
+        let is_found = || !nodes.is_empty() && nodes.contains(&id.ros2_node());
+        flow.ros2.is_some_and(|other| other.id == network.id || is_found())
     };
     let mut others = world.flows.iter().filter(|(id, flow)| {
         id.layer != world.me.layer && flow.reach != Reach::Down && is_there(id, flow)
@@ -205,7 +244,7 @@ mod tests {
     #[test]
     fn a_network_belongs_to_the_layer_whose_flow_is_older() {
         let nobody = BTreeSet::new();
-        let of = |lines: &[&str], epochs: [u64; 2], found: &BTreeSet<FlowId>| {
+        let of = |lines: &[&str], epochs: [u64; 2], found: &BTreeSet<String>| {
             let mut world = world(lines);
             for (view, epoch) in world.flows.values_mut().zip(epochs) {
                 view.epoch = epoch;
@@ -223,7 +262,10 @@ mod tests {
         assert_eq!(of(&["f/a net1", "f/m net1"], [1, 2], &nobody), None, "one layer");
         let two = ["e/a net9", "f/m net1"];
         assert_eq!(of(&two, [1, 2], &nobody), None);
-        assert_eq!(of(&two, [1, 2], &BTreeSet::from([id("e/a")])), held, "found on it");
-        assert_eq!(of(&["e/a", "f/m net1"], [1, 2], &BTreeSet::from([id("e/a")])), None);
+        assert_eq!(of(&two, [1, 2], &BTreeSet::from([id("e/a").ros2_node()])), held, "found on it");
+        assert_eq!(
+            of(&["e/a", "f/m net1"], [1, 2], &BTreeSet::from([id("e/a").ros2_node()])),
+            None
+        );
     }
 }

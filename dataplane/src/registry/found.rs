@@ -22,8 +22,6 @@ use crate::plan::network::{Candidate, candidates, claimant, heir, is_of_service}
 use crate::plan::told::{merge_offers, merge_requests};
 use crate::world::{Advertise, Request, Ros2Network, ScopeEntry, Source};
 
-/// Most endpoints that are followed.
-pub const MAX_ENDPOINTS: usize = 10_000;
 /// A writer that no flow of the network has claimed for this long goes to the one that hashing
 /// chooses.
 const CLAIM_WITHIN: Duration = Duration::from_secs(2);
@@ -64,14 +62,20 @@ struct Held {
     unclaimed: Option<Instant>,
 }
 
-/// All found endpoints, bounded.
+impl Held {
+    fn new(endpoint: FoundEndpoint) -> Self {
+        Self { endpoint, owner: None, unclaimed: None }
+    }
+}
+
+/// All found endpoints; the adapter bounds them.
 #[derive(Default)]
 pub(super) struct Found {
     /// Where this flow is, whether or not it may use the network.
     pub(super) network: Option<Ros2Network>,
     topics: BTreeMap<TopicName, Vec<Held>>,
-    count: usize,
-    refused: u64,
+    /// Writers have other owners than when that was last asked for.
+    owners_changed: bool,
     /// The flows that could own an endpoint, when that was last looked at.
     candidates: Vec<Candidate>,
     /// When an unclaimed endpoint goes to the next one.
@@ -79,43 +83,49 @@ pub(super) struct Found {
 }
 
 impl Found {
-    /// Replaces what was found of a topic; what was there before keeps its place.
-    fn set(&mut self, topic: &TopicName, mut endpoints: Vec<FoundEndpoint>) {
-        let old = self.topics.remove(topic).unwrap_or_default();
-        self.count -= old.len();
-        let mut known: BTreeMap<WriterId, Held> =
-            old.into_iter().map(|held| (held.endpoint.guid, held)).collect();
-        endpoints.sort_by_key(|endpoint| !known.contains_key(&endpoint.guid));
-        let room = MAX_ENDPOINTS - self.count;
-        self.refused += endpoints.len().saturating_sub(room) as u64;
-        endpoints.truncate(room);
-        let hold = |endpoint: FoundEndpoint| {
-            let before = known.remove(&endpoint.guid);
-            let (owner, unclaimed) =
-                before.map_or((None, None), |held| (held.owner, held.unclaimed));
-            Held { endpoint, owner, unclaimed }
-        };
-        let held: Vec<Held> = endpoints.into_iter().map(hold).collect();
-        self.count += held.len();
-        if !held.is_empty() {
-            self.topics.insert(topic.clone(), held);
+    /// Replaces what was found. Returns the topics of which something has changed.
+    fn set(&mut self, mut found: BTreeMap<TopicName, Vec<FoundEndpoint>>) -> BTreeSet<TopicName> {
+        let mut changed = BTreeSet::new();
+        self.topics.retain(|topic, held| {
+            let endpoints = found.remove(topic).unwrap_or_default();
+            if held.iter().map(|held| &held.endpoint).eq(&endpoints) {
+                return true;
+            }
+            changed.insert(topic.clone());
+            let mut known: BTreeMap<WriterId, Held> =
+                held.drain(..).map(|held| (held.endpoint.guid, held)).collect();
+            let hold = |endpoint: FoundEndpoint| match known.remove(&endpoint.guid) {
+                Some(before) => Held { endpoint, ..before },
+                None => Held::new(endpoint),
+            };
+            held.extend(endpoints.into_iter().map(hold));
+            !held.is_empty()
+        });
+        for (topic, endpoints) in found.into_iter().filter(|(_, found)| !found.is_empty()) {
+            changed.insert(topic.clone());
+            self.topics.insert(topic, endpoints.into_iter().map(Held::new).collect());
         }
+        self.owners_changed |= !changed.is_empty();
+        changed
     }
 
     /// Finds the owners of a topic's endpoints.
     fn assign(&mut self, now: Instant, topic: &TopicName) {
         for held in self.topics.get_mut(topic).into_iter().flatten() {
             let (guid, locators) = (held.endpoint.guid, &held.endpoint.locators);
-            if let Some(owner) = claimant(&self.candidates, locators, guid) {
-                (held.owner, held.unclaimed) = (Some(owner.clone()), None);
-                continue;
-            }
-            let at = *held.unclaimed.get_or_insert(now) + CLAIM_WITHIN;
-            if at > now {
-                held.owner = None;
-                self.due = Some(self.due.map_or(at, |due| due.min(at)));
+            let owner = if let Some(owner) = claimant(&self.candidates, locators, guid) {
+                held.unclaimed = None;
+                Some(owner)
             } else {
-                held.owner = heir(&self.candidates, guid).cloned();
+                let at = *held.unclaimed.get_or_insert(now) + CLAIM_WITHIN;
+                if at > now {
+                    self.due = Some(self.due.map_or(at, |due| due.min(at)));
+                }
+                heir(&self.candidates, guid).filter(|_| at <= now)
+            };
+            if held.owner.as_ref() != owner {
+                held.owner = owner.cloned();
+                self.owners_changed = true;
             }
         }
     }
@@ -175,17 +185,30 @@ impl Registry {
         }
     }
 
-    /// Replaces what was found of a topic on the ROS 2 network; an empty list takes it away.
-    /// Returns the topics to plan anew.
+    /// Replaces what was found on the ROS 2 network, by topic. Returns the topics to plan anew.
     pub fn set_found(
         &mut self,
         now: Instant,
-        topic: &TopicName,
-        endpoints: Vec<FoundEndpoint>,
+        found: BTreeMap<TopicName, Vec<FoundEndpoint>>,
     ) -> BTreeSet<TopicName> {
-        self.found.set(topic, endpoints);
-        self.found.assign(now, topic);
-        self.refresh(now, BTreeSet::from([topic.clone()]))
+        let changed = self.found.set(found);
+        for topic in &changed {
+            self.found.assign(now, topic);
+        }
+        self.refresh(now, changed)
+    }
+
+    /// Whether this flow owns each writer that has an owner, if that is not the same as when it was
+    /// last taken.
+    pub fn take_owned(&mut self) -> Option<BTreeMap<WriterId, bool>> {
+        if !std::mem::take(&mut self.found.owners_changed) {
+            return None;
+        }
+        let writers = self.found.topics.values().flatten();
+        let writers = writers.filter(|held| held.endpoint.kind == LeaseKind::Advertise);
+        let owned = writers
+            .filter_map(|held| Some((held.endpoint.guid, *held.owner.as_ref()? == self.config.me)));
+        Some(owned.collect())
     }
 
     /// Gives endpoints to other flows where flows of the network have come or gone, and those that
@@ -214,12 +237,6 @@ impl Registry {
     ) -> impl Iterator<Item = (&'a FoundEndpoint, Option<&'a FlowId>)> + use<'a> {
         let held = self.found.topics.get(topic).into_iter().flatten();
         held.map(|held| (&held.endpoint, held.owner.as_ref()))
-    }
-
-    /// How many endpoints are followed, and how many were refused because there were too many.
-    #[must_use]
-    pub fn found_counts(&self) -> (usize, u64) {
-        (self.found.count, self.found.refused)
     }
 }
 

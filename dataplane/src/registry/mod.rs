@@ -43,7 +43,7 @@ use blaze_proto::link::link_control::{Body, RouteState};
 
 use announce::{Announcer, MAX_LEASED_ENTRIES};
 use found::Found;
-pub use found::{FoundEndpoint, MAX_ENDPOINTS};
+pub use found::FoundEndpoint;
 use leases::LeaseTable;
 pub use leases::{LapseReason, LapsedLease, LeaseKey, LeaseView, Terms};
 pub use loads::{Load, REST};

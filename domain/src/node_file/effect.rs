@@ -7,7 +7,7 @@ use super::walk::Node;
 const NOT_YET: &str = "not in effect in this version";
 
 /// Sections without effect, each worth one warning.
-const SECTIONS: &[&str] = &["brokers.plugins", "monitor"];
+const SECTIONS: &[&str] = &["monitor"];
 
 /// Keys without effect in sections that have one: one warning per section.
 const KEYS: &[(&str, &[&str])] = &[("admin", &["monitor"])];

@@ -40,7 +40,8 @@ fn cloud(network: u64, epoch: u64) -> Hello {
 fn of_two_layers_on_one_network_the_later_one_uses_it_no_longer() {
     let mut bench = Bench::inside();
     bench.core.set_ros2_network(bench.now, Some(HERE));
-    bench.core.set_found(bench.now, &"chatter".parse().unwrap(), vec![reader()]);
+    let found = BTreeMap::from([("chatter".parse().unwrap(), vec![reader()])]);
+    bench.core.set_found(bench.now, found);
     bench.send(Scope::Node, &lease("advertise", "chatter"));
     bench.step(300);
     assert_eq!(bench.bridges("chatter"), ["node>ros2"]);
@@ -52,8 +53,8 @@ fn of_two_layers_on_one_network_the_later_one_uses_it_no_longer() {
     assert_eq!(bench.core.ros2_holder(), None);
     // Its participant was found on this one all the same: of equal lives the smaller name stays.
     bench.outputs.clear();
-    let found = BTreeSet::from(["cloud/c".parse().unwrap()]);
-    bench.core.set_ros2_flows(bench.now, found);
+    let found = BTreeSet::from(["/blaze/cloud_c".to_owned()]);
+    bench.core.set_ros2_nodes(bench.now, found);
     bench.step(300);
     assert_eq!(bench.core.ros2_holder().unwrap().to_string(), "cloud/c");
     assert_eq!(bench.bridges("chatter"), [""; 0]);

@@ -31,6 +31,7 @@ fn endpoint(guid: u8, kind: LeaseKind, address: u8) -> FoundEndpoint {
 /// Two flows on one network, `edge/a` at 10.0.0.1 and `edge/b` at 10.0.0.2, that know each other.
 struct Pair {
     flows: [Registry; 2],
+    found: BTreeMap<TopicName, Vec<FoundEndpoint>>,
     now: Instant,
 }
 
@@ -43,7 +44,8 @@ impl Pair {
             registry.set_ros2_network(now, Some(at(address)));
             registry
         };
-        let mut pair = Self { flows: [flow("edge/a", 1), flow("edge/b", 2)], now };
+        let mut pair =
+            Self { flows: [flow("edge/a", 1), flow("edge/b", 2)], found: BTreeMap::new(), now };
         pair.exchange();
         pair
     }
@@ -72,8 +74,9 @@ impl Pair {
 
     /// Both adapters find the same.
     fn find(&mut self, name: &str, endpoints: &[FoundEndpoint]) {
+        self.found.insert(topic(name), endpoints.to_vec());
         for flow in &mut self.flows {
-            flow.set_found(self.now, &topic(name), endpoints.to_vec());
+            flow.set_found(self.now, self.found.clone());
         }
     }
 
@@ -170,27 +173,27 @@ fn a_network_that_is_in_use_is_as_if_it_was_not_there() {
 }
 
 #[test]
-fn endpoints_are_bounded_and_those_that_were_there_stay() {
+fn the_adapter_is_told_which_writers_to_read() {
     let mut pair = Pair::new();
-    let flow = &mut pair.flows[0];
-    let many = |from: u32, count: u32| -> Vec<FoundEndpoint> {
-        let one = |n: u32| FoundEndpoint {
-            guid: WriterId(u128::from(n).to_be_bytes()),
-            ..endpoint(0, LeaseKind::Request, 1)
-        };
-        (from..from + count).map(one).collect()
-    };
-    flow.set_found(pair.now, &topic("a"), many(100, 9_000));
-    flow.set_found(pair.now, &topic("b"), many(20_000, 1_500));
-    assert_eq!(flow.found_counts(), (10_000, 500));
-    // Newer ones that come first push out none of those that were there.
-    let mut all = many(0, 1);
-    all.extend(many(20_000, 1_000));
-    flow.set_found(pair.now, &topic("b"), all);
-    assert_eq!(flow.found_counts(), (10_000, 501));
-    assert!(flow.found(&topic("b")).all(|(endpoint, _)| endpoint.guid != WriterId([0; 16])));
-    flow.set_found(pair.now, &topic("a"), Vec::new());
-    assert_eq!(flow.found_counts().0, 1_000);
+    assert_eq!(pair.flows[0].take_owned(), None);
+    let (writer, reader) = (LeaseKind::Advertise, LeaseKind::Request);
+    let of_b = endpoint(2, writer, 2);
+    let all =
+        [endpoint(1, writer, 1), of_b.clone(), endpoint(3, writer, 9), endpoint(4, reader, 1)];
+    pair.find("chatter", &all);
+    let owned = BTreeMap::from([(WriterId([1; 16]), true), (WriterId([2; 16]), false)]);
+    assert_eq!(pair.flows[0].take_owned(), Some(owned), "the third is not decided yet");
+    pair.find("chatter", &all);
+    assert_eq!(pair.flows[0].take_owned(), None, "nothing is new");
+    pair.flows[0].set_reach(pair.now, &"edge/b".parse().unwrap(), Reach::Down);
+    pair.now += Duration::from_secs(3);
+    pair.flows[0].update_found(pair.now);
+    pair.now += Duration::from_secs(3);
+    pair.flows[0].update_found(pair.now);
+    let owned = pair.flows[0].take_owned().unwrap();
+    assert!(owned.len() == 3 && owned.values().all(|is_own| *is_own), "{owned:?}");
+    pair.find("chatter", &[of_b]);
+    assert_eq!(pair.flows[0].take_owned().unwrap().len(), 1);
 }
 
 #[test]

@@ -46,6 +46,7 @@ async fn flow(
             mtu: 1500,
             chunking: Chunking::Mtu,
         }),
+        ros2: None,
         live: LiveSettings::from(&FlowSection {
             bandwidth: BandwidthSection { limit_mbps: LIMIT_MBPS, ..BandwidthSection::default() },
             ..FlowSection::default()

@@ -43,6 +43,7 @@ impl Node {
             kind: LayerKind::Fog,
             admin: "127.0.0.1:0".parse().unwrap(),
             inter: None,
+            ros2: None,
             live: LiveSettings::from(&FlowSection::default()),
         };
         let options = FlowOptions {

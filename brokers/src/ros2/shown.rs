@@ -1,0 +1,87 @@
+//! Topics that show on the network though nobody there has asked for them: idle writers, so that
+//! `ros2 topic list` and rviz know them.
+//!
+//! An idle writer goes when the topic is written in its type, after the one that is used stands.
+
+use std::collections::BTreeMap;
+
+use blaze_domain::TopicName;
+
+use super::names::RosName;
+use super::offers::{Offer, Offered};
+use super::{Inner, MAX_SHOWN};
+use crate::dds::adapter::TopicPublisher;
+use crate::port::PublisherOptions;
+
+/// What shows of a topic.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Shown {
+    /// ROS type, such as `sensor_msgs/msg/Imu`.
+    pub type_name: String,
+    /// Lost messages are sent again.
+    pub reliable: bool,
+    /// Late joiners get the last messages of each writer.
+    pub durable: bool,
+}
+
+struct Idle {
+    topic: TopicName,
+    shown: Shown,
+    /// What its writer offers, if there is one.
+    writer: Option<(Offered, TopicPublisher)>,
+}
+
+/// All topics that are to show.
+#[derive(Default)]
+pub(super) struct AllShown {
+    by_name: BTreeMap<RosName, Idle>,
+}
+
+impl AllShown {
+    /// Lets a topic show, or no longer. Returns whether there is room for it.
+    pub(super) fn set(&mut self, topic: TopicName, name: RosName, shown: Option<Shown>) -> bool {
+        let Some(shown) = shown else {
+            self.by_name.remove(&name);
+            return true;
+        };
+        if self.by_name.get(&name).is_some_and(|idle| idle.shown == shown) {
+            return true;
+        }
+        if self.by_name.len() >= MAX_SHOWN && !self.by_name.contains_key(&name) {
+            return false;
+        }
+        self.by_name.insert(name, Idle { topic, shown, writer: None });
+        true
+    }
+
+    /// Names of all of them.
+    pub(super) fn names(&self) -> Vec<RosName> {
+        self.by_name.keys().cloned().collect()
+    }
+
+    /// Makes the idle writer of a topic, or one that offers what readers ask for now; ends the one
+    /// that is not needed beside those of `offers`.
+    pub(super) fn follow<'a>(
+        &mut self,
+        inner: &Inner,
+        name: &RosName,
+        mut offers: impl Iterator<Item = &'a Offer>,
+    ) {
+        let Some(Idle { topic, shown, writer }) = self.by_name.get_mut(name) else { return };
+        if offers.any(|offer| offer.writes(&shown.type_name)) {
+            *writer = None;
+            return;
+        }
+        let offered = inner.offered(name, &shown.type_name, shown.reliable);
+        if writer.as_ref().is_some_and(|(before, _)| *before == offered) {
+            return;
+        }
+        let options = PublisherOptions {
+            reliable: offered.reliable,
+            depth: u32::from(shown.durable),
+            ..PublisherOptions::default()
+        };
+        let made = inner.idle_writer(name, topic, &shown.type_name, offered.terms, options);
+        *writer = made.map(|made| (offered, made));
+    }
+}
