@@ -15,6 +15,7 @@ from cyclonedds.core import Listener, Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
+from cyclonedds.internal import InvalidSample
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from rclpy.serialization import deserialize_message, serialize_message
@@ -50,7 +51,7 @@ def struct_type(name: str, raw: bool = False) -> type:
     if raw:
         made.__init__ = lambda self, data: setattr(self, "cdr", data)
         made.serialize = lambda self, **_: self.cdr
-        made.deserialize = classmethod(lambda _, data, **__: made(bytes(data)))
+        made.deserialize = made.deserialize_key = classmethod(lambda _, data, **__: made(bytes(data)))
     return made
 
 
@@ -110,7 +111,8 @@ class OwnNode:
         class Receive(Listener):
             def on_data_available(self, reader):
                 for sample in reader.take(TAKEN_AT_ONCE):
-                    receive(sample.cdr)
+                    if not isinstance(sample, InvalidSample):
+                        receive(sample.cdr)
 
         qos = quality(qos, f"typehash={type_hash(type)};")
         return DataReader(self.participant, self.topic(topic, type, qos), qos=qos, listener=Receive())

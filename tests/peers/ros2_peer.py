@@ -1,6 +1,6 @@
 """A ROS 2 peer of the tests with rclpy and Fast DDS. Commands: peer.py."""
 
-import os
+import gc
 import threading
 import time
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from test_msgs.action import Fibonacci
@@ -49,15 +49,17 @@ class OwnNode:
     def spin(self) -> None:
         try:
             self.executor.spin()
-        except Exception:  # An end while it waits.
-            if self.context.ok():
-                raise
+        except ExternalShutdownException:
+            pass
 
     def close(self) -> None:
         self.executor.shutdown()
         self.thread.join()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
+        # The participant ends with the last reference to its context.
+        del self.executor, self.node, self.context
+        gc.collect()
 
 
 class Ros2Peer(peer.Peer):
@@ -66,8 +68,8 @@ class Ros2Peer(peer.Peer):
         self.nodes = {}
 
     def close(self) -> None:
-        for node in self.nodes.values():
-            node.close()
+        for node in list(self.nodes):
+            self.op_destroy(node)
 
     def op_node(self, node, namespace="/") -> dict:
         self.nodes[node] = OwnNode(node, namespace)
@@ -224,4 +226,3 @@ def result(future, deadline: float):
 
 if __name__ == "__main__":
     Ros2Peer().run(rclpy.get_rmw_implementation_identifier())
-    os._exit(0)  # Threads of rclpy that still wait end with the process.

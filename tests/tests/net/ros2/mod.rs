@@ -1,0 +1,3 @@
+//! ROS 2: rclpy and Cyclone DDS beside flows.
+
+mod direct;
