@@ -18,6 +18,7 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.internal import InvalidSample
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from cyclonedds.util import duration
 from rclpy.serialization import deserialize_message, serialize_message
 
 import peer
@@ -80,7 +81,7 @@ def quality(given: dict, user_data: str = "") -> Qos:
     given = {**peer.QOS, **given}
     times = {"deadline_ms": Policy.Deadline, "lease_ms": Policy.Liveliness.Automatic, "lifespan_ms": Policy.Lifespan}
     return Qos(
-        Policy.Reliability.Reliable(100_000_000) if given["reliable"] else Policy.Reliability.BestEffort,
+        Policy.Reliability.Reliable(duration(infinite=True)) if given["reliable"] else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if given["durable"] else Policy.Durability.Volatile,
         Policy.DurabilityService(0, Policy.History.KeepLast(given["depth"]), -1, -1, -1),
         Policy.History.KeepLast(given["depth"]),

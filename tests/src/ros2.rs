@@ -50,6 +50,14 @@ impl Release {
         }
     }
 
+    /// Fast DDS 2 knows the old name alone.
+    fn profile_variable(self) -> &'static str {
+        match self {
+            Self::Jazzy | Self::Cyclone => "FASTRTPS_DEFAULT_PROFILES_FILE",
+            Self::Kilted => "FASTDDS_DEFAULT_PROFILES_FILE",
+        }
+    }
+
     fn program(self) -> &'static str {
         match self {
             Self::Jazzy | Self::Kilted => "ros2_peer.py",
@@ -166,7 +174,7 @@ impl Peer {
             .arg(programs.join(release.program()))
             .env("ROS_DOMAIN_ID", domain.to_string())
             .env("ROS_LOG_DIR", folder.path())
-            .env("FASTDDS_DEFAULT_PROFILES_FILE", &profile)
+            .env(release.profile_variable(), &profile)
             .env(
                 "CYCLONEDDS_URI",
                 format!(
