@@ -90,11 +90,11 @@ pub(super) fn subscribe(rounds: usize) -> anyhow::Result<()> {
     let (robot, cloud) = (pair.on_robot(Release::Jazzy)?, pair.in_cloud(Release::Kilted)?);
     robot.node("driver")?;
     let publishers = (0..TOPICS)
-        .map(|number| robot.publisher("driver", &format!("/often/{number}"), KIND, DEEP));
+        .map(|number| robot.publisher("driver", &format!("/often/t{number}"), KIND, DEEP));
     let publishers = publishers.collect::<anyhow::Result<Vec<_>>>()?;
     let before = usage(&pair)?;
     for round in 0..rounds {
-        let topic = format!("/often/{}", round % TOPICS);
+        let topic = format!("/often/t{}", round % TOPICS);
         let subscription = cloud.subscription(NODE, &topic, KIND, DEEP)?;
         // Some are met by the publisher, others end before.
         if round % 7 == 0 {
@@ -105,6 +105,8 @@ pub(super) fn subscribe(rounds: usize) -> anyhow::Result<()> {
         }
         subscription.destroy()?;
     }
+    let routes = || pair.edge.bridges_up().len() + pair.cloud.bridges_up().len();
+    wait::until("no route is left", MEET, || routes() == 0, || pair.state("/often/t0"))?;
     for publisher in &publishers {
         publisher.wait_matched(0, MEET)?;
     }
@@ -121,7 +123,7 @@ pub(super) fn crowd(nodes: usize) -> anyhow::Result<()> {
     let shared = cloud.subscription("recorder", "/crowd", KIND, DEEP)?;
     let (mut own, mut publishers) = (Vec::new(), Vec::new());
     for number in 0..nodes {
-        let (node, topic) = (format!("driver_{number}"), format!("/crowd/{number}"));
+        let (node, topic) = (format!("driver_{number}"), format!("/crowd/t{number}"));
         robot.node(&node)?;
         own.push(cloud.subscription("recorder", &topic, KIND, DEEP)?);
         publishers.push((
@@ -131,7 +133,7 @@ pub(super) fn crowd(nodes: usize) -> anyhow::Result<()> {
     }
     let mut all = Vec::new();
     for ((number, (publisher, common)), own) in (0..).zip(&publishers).zip(&own) {
-        let topic = format!("/crowd/{number}");
+        let topic = format!("/crowd/t{number}");
         pair.wait_route(&topic, publisher, own)?;
         pair.wait_route("/crowd", common, &shared)?;
         let stream = Stream { count: 3, size: 50, hz: 0.0, seed: number };

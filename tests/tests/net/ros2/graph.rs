@@ -46,9 +46,14 @@ fn the_cloud_shows_the_topics_of_the_robot_before_anybody_subscribes() -> anyhow
         for (topic, _) in TOPICS {
             let own = publishers(&robot, topic)?;
             let (_, hash) = own.first().with_context(|| format!("{topic} on the robot"))?;
+            let named = || {
+                let shown = publishers(&cloud, topic).unwrap_or_default();
+                let is_it = |(node, _): &(Value, Value)| node == "/blaze/cloud_cloud_1";
+                shown.len() == 1 && shown.iter().all(is_it)
+            };
+            let state = || format!("{:?}", publishers(&cloud, topic));
+            wait::until(&format!("{topic} is of the flow's node"), MEET, named, state)?;
             let shown = publishers(&cloud, topic)?;
-            assert_eq!(shown.len(), 1, "{topic}: {shown:?}");
-            assert_eq!(shown[0].0, "/blaze/cloud_cloud_1", "{topic}");
             // RustDDS sends no user data, so there is no hash to show.
             println!("{release:?} sees {topic} as {}, on the robot {hash}", shown[0].1);
         }

@@ -53,7 +53,7 @@ fn rows() -> Vec<Row> {
     let rows = [true, false].into_iter().flat_map(|writer_first| {
         let side = if writer_first { "writer" } else { "reader" };
         pairs.iter().enumerate().map(move |(number, (writer, reader))| Row {
-            topic: format!("/{side}_first/{number}"),
+            topic: format!("/{side}_first/row_{number}"),
             writer: *writer,
             reader: *reader,
             writer_first,
