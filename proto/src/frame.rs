@@ -9,6 +9,7 @@
 //! them beside the bytes, and only a writer that puts the frame on a broker encodes them
 //! ([`Frame::head_to_write`]). Only [`Frame::to_bytes`] copies the payload.
 
+mod addressed;
 mod compressed;
 mod header;
 mod index;

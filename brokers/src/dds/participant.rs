@@ -147,8 +147,10 @@ pub struct Terms {
     pub marked: bool,
     /// A writer offers a sample at least this often; a reader asks for that.
     pub deadline: Option<time::Duration>,
-    /// A writer tells this often that it lives, by itself; a reader asks for that.
+    /// A writer tells this often that it lives; a reader asks for that.
     pub lease: Option<time::Duration>,
+    /// It tells so by writing (MANUAL_BY_TOPIC), else by itself.
+    pub manual: bool,
 }
 
 impl Profile {
@@ -174,8 +176,10 @@ impl Profile {
         if let Some(deadline) = self.terms.deadline {
             builder = builder.deadline(Deadline(duration(deadline)));
         }
-        if let Some(lease) = self.terms.lease {
-            let lease_duration = duration(lease);
+        let lease_duration = self.terms.lease.map_or(Duration::INFINITE, duration);
+        if self.terms.manual {
+            builder = builder.liveliness(Liveliness::ManualByTopic { lease_duration });
+        } else if self.terms.lease.is_some() {
             builder = builder.liveliness(Liveliness::Automatic { lease_duration });
         }
         if self.terms.marked {

@@ -6,19 +6,22 @@ use std::time::Instant;
 
 use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, ServiceName, WriterId};
 use blaze_proto::{Frame, Header};
+use bytes::Bytes;
 use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use super::Inner;
+use super::endpoint::RosEndpoint;
 use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
-use super::names::type_of_dds;
+use super::names::Carries;
 use super::network::Knowledge;
+use super::services::{Forwarded, OnWire, Services, carries};
 use crate::dds::adapter::{
     Admission, Companion, Dialect, Encoded, NoMessage, Others, Topic, nanos,
 };
 use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
-    Relay, Sample, Terms, Writer,
+    Relay, Sample, Terms, Writer, Written,
 };
 use crate::outbox::Body;
 use crate::port::Content;
@@ -39,6 +42,7 @@ pub(super) struct Ros {
     pub(super) flow: FlowId,
     pub(super) gid: GidLength,
     pub(super) knowledge: Arc<Knowledge>,
+    pub(super) services: Arc<Services>,
     /// Announces the participant to peers, and to those of this host that RustDDS leaves out.
     pub(super) relay: Relay,
     /// Who reads and writes topics; none while it is opened.
@@ -63,6 +67,7 @@ impl Dialect for Ros {
         _: Instant,
     ) -> Result<Box<dyn Companion>, DdsError> {
         self.relay.set_participant(participant.prefix());
+        self.knowledge.set_own(participant.prefix());
         let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,
@@ -77,16 +82,14 @@ impl Dialect for Ros {
             gid: self.gid,
             node: self.flow.ros2_node(),
             knowledge: Arc::clone(&self.knowledge),
+            user: Arc::clone(&self.user),
             told: None,
         }))
     }
 
-    fn mixes_durability(&self) -> bool {
-        true
-    }
-
     fn note_endpoints(&self, endpoints: &Endpoints) {
         self.knowledge.note_endpoints(Instant::now(), endpoints);
+        self.knowledge.forget_requests(&mut self.services.lock());
         if let Some(user) = self.user.get().and_then(Weak::upgrade) {
             user.follow();
         }
@@ -115,7 +118,11 @@ impl Dialect for Ros {
             instance: "0".to_owned(),
             epoch: 0,
         };
+        let (payload, answers) = self.of_service(topic, &writer, sample, sequence)?;
+        let (related, to) = answers.map_or((None, String::new()), |of| (Some(of.request), of.flow));
         let header = Header {
+            related,
+            to,
             encoding: format!("application/cdr; type={type_name}"),
             type_hash: writer.type_hash.clone().unwrap_or_default(),
             lifespan_ms: writer.lifespan_ms(),
@@ -130,17 +137,12 @@ impl Dialect for Ros {
                 u64::try_from(written).unwrap_or(0),
             )
         };
-        let frame = Frame::new(&header, sample.sample.payload().clone());
+        let frame = Frame::new(&header, payload);
         frame.map(Content::Frame).map_err(|_| NoMessage::Malformed)
     }
 
-    fn encode(&self, topic: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
+    fn encode(&self, _: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
         let Body::Frame(frame) = message else { return Err(DropReason::BrokerError) };
-        if let Some((_, told)) = frame.encoding().split_once("type=")
-            && type_of_dds(&topic.type_name).as_deref() != Some(told.trim())
-        {
-            return Err(DropReason::BrokerError);
-        }
         let cdr = Cdr::little(frame.payload().clone()).ok_or(DropReason::BrokerError)?;
         let mut options = WriteOptionsBuilder::new();
         if let Some(written) = timestamp(frame.publish_time_ns()) {
@@ -149,9 +151,81 @@ impl Dialect for Ros {
         Ok(Encoded { cdr, options })
     }
 
+    /// Requests and replies bear what their server or client knows them by.
+    fn write(
+        &self,
+        topic: &Topic,
+        message: &Body,
+        durable: bool,
+        writer: &Writer,
+    ) -> Result<Written, DropReason> {
+        let carries = carries(&topic.name);
+        let Encoded { cdr, options } = self.encode(topic, message, durable)?;
+        let Body::Frame(frame) = message else { return Err(DropReason::BrokerError) };
+        if carries == Carries::Messages {
+            return Ok(writer.write_cdr(cdr, options));
+        }
+        // Held until it is noted whose request it is: the server may answer at once.
+        let mut services = self.services.lock();
+        let request = (frame.writer(), frame.sequence());
+        let known_as = if carries == Carries::Requests {
+            self.knowledge
+                .is_served_by_cyclone(&topic.name)
+                .then(|| services.next_header(&writer.id()))
+        } else {
+            let answered = frame.related().and_then(|request| services.asked(&request));
+            // Its client has gone, or has its reply.
+            Some(answered.ok_or(DropReason::NoDestination)?)
+        };
+        let (payload, related) = known_as
+            .map_or((cdr.payload().clone(), None), |known_as| known_as.put_on(cdr.payload()));
+        let cdr = Cdr::little(payload).ok_or(DropReason::BrokerError)?;
+        let written = writer.write_cdr(cdr, options.related_sample_identity_opt(related));
+        match (written, carries) {
+            (Written::Taken(number), Carries::Requests) => {
+                let known_as = known_as.unwrap_or(OnWire::Related(writer.id(), number));
+                let flow = format!("{}/{}", frame.origin_layer(), frame.origin_node());
+                services.note_forwarded(&topic.name, known_as, Forwarded { request, flow });
+            }
+            (Written::Taken(_), _) => {
+                frame.related().inspect(|request| services.note_answered(request));
+            }
+            _ => {}
+        }
+        Ok(written)
+    }
+
     /// What a flow writes to the network it does not read from there.
     fn own(&self, _: &Topic, _: &Body) -> Option<Content> {
         None
+    }
+}
+
+impl Ros {
+    /// The payload of a sample as others send it, and which request it answers.
+    fn of_service(
+        &self,
+        topic: &Topic,
+        writer: &RosEndpoint,
+        sample: &Sample,
+        sequence: u64,
+    ) -> Result<(Bytes, Option<Forwarded>), NoMessage> {
+        match carries(&topic.name) {
+            Carries::Messages => Ok((sample.sample.payload().clone(), None)),
+            Carries::Requests => {
+                let (known_as, payload) =
+                    OnWire::of_request(writer.vendor, sample).ok_or(NoMessage::Malformed)?;
+                self.services.lock().note_asked((WriterId(writer.id), sequence), known_as);
+                Ok((payload, None))
+            }
+            Carries::Replies => {
+                let (known_as, payload) =
+                    OnWire::of_reply(writer.vendor, sample).ok_or(NoMessage::Malformed)?;
+                // Others answer to clients of this network.
+                let answers = self.services.lock().take_forwarded(&known_as);
+                Ok((payload, Some(answers.ok_or(NoMessage::NotForUs)?)))
+            }
+        }
     }
 }
 
@@ -178,6 +252,7 @@ struct Graph {
     /// Full name of the own node.
     node: String,
     knowledge: Arc<Knowledge>,
+    user: Arc<OnceLock<Weak<Inner>>>,
     told: Option<ParticipantNodes>,
 }
 
@@ -197,7 +272,10 @@ impl Companion for Graph {
                 None => others.note_malformed(),
             }
         }
-        self.knowledge.tick(now, own);
+        self.knowledge.tick(now);
+        if let Some(user) = self.user.get().and_then(Weak::upgrade) {
+            user.tick(now);
+        }
         false
     }
 }

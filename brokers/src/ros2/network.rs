@@ -5,12 +5,15 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use blaze_domain::WriterId;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::endpoint::RosEndpoint;
+use super::endpoint::{RosEndpoint, Vendor};
 use super::graph::ParticipantNodes;
 use super::names::RosName;
+use super::services;
+
 use crate::dds::adapter::Admission;
 
 use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix, participant_of};
@@ -118,11 +121,14 @@ impl Knowledge {
         self.publish(&state, now);
     }
 
-    /// Lets those count whose time has come. `own`: the own participant.
-    pub(super) fn tick(&self, now: Instant, own: GuidPrefix) {
-        let mut state = self.state.lock();
-        state.own = Some(own);
-        self.publish(&state, now);
+    /// Takes over the own participant, before it has readers.
+    pub(super) fn set_own(&self, own: GuidPrefix) {
+        self.state.lock().own = Some(own);
+    }
+
+    /// Lets those count whose time has come.
+    pub(super) fn tick(&self, now: Instant) {
+        self.publish(&self.state.lock(), now);
     }
 
     /// Which writers this flow takes messages of; those of others wait until they are named.
@@ -133,8 +139,12 @@ impl Knowledge {
     /// Whether a sample of a writer is to be taken.
     pub(super) fn admission(&self, writer: &EndpointId) -> Admission {
         let state = self.state.lock();
+        let is_own = state.own == Some(participant_of(writer));
+        // RustDDS gives what this flow writes to its readers, too.
         match state.owned.get(writer) {
-            _ if state.marked.contains(writer) => Admission::No,
+            _ if is_own || state.marked.contains(writer) || state.is_unreadable(writer) => {
+                Admission::No
+            }
             Some(true) => Admission::Yes,
             Some(false) => Admission::No,
             None => Admission::Later,
@@ -152,6 +162,24 @@ impl Knowledge {
         let state = self.state.lock();
         let found = state.by_name.get(name).map(|of_name| &of_name[usize::from(writers)]);
         found.cloned().unwrap_or_default()
+    }
+
+    /// Whether the first server that reads these requests is of Cyclone.
+    pub(super) fn is_served_by_cyclone(&self, dds_topic: &str) -> bool {
+        let servers = RosName::of_dds(dds_topic).map(|name| self.endpoints(&name, false));
+        let first = servers.as_ref().and_then(|servers| servers.iter().min_by_key(|it| it.id));
+        first.is_some_and(|server| server.vendor == Vendor::CycloneDds)
+    }
+
+    /// Requests are forgotten whose clients or servers have gone.
+    pub(super) fn forget_requests(&self, requests: &mut services::State) {
+        let state = self.state.lock();
+        let is_client = |client: &WriterId| state.endpoints.contains_key(&client.0);
+        let is_served = |topic: &str| {
+            let name = RosName::of_dds(topic);
+            name.and_then(|name| state.by_name.get(&name)).is_some_and(|it| !it[0].is_empty())
+        };
+        requests.retain(is_client, is_served);
     }
 
     fn publish(&self, state: &State, now: Instant) {
@@ -181,6 +209,11 @@ impl Knowledge {
 }
 
 impl State {
+    /// Whether a writer has no type of ROS 2, so that nobody decides about it.
+    fn is_unreadable(&self, writer: &EndpointId) -> bool {
+        self.endpoints.get(writer).is_some_and(|entry| !entry.endpoint.is_readable())
+    }
+
     /// Puts in what was found, with its node and when it was found first.
     fn put(&mut self, known: Option<Entry>, mut endpoint: RosEndpoint, now: Instant) {
         if self.endpoints.len() >= MAX_ENDPOINTS {
@@ -233,7 +266,7 @@ mod tests {
         knowledge.note_nodes(now, told.participant(), &nodes);
         let a = ("/a".to_owned(), Some("/arm/talker".to_owned()));
         assert_eq!(names(&knowledge), std::slice::from_ref(&a));
-        knowledge.tick(now + NODE_WAIT, GuidPrefix([9; 12]));
+        knowledge.tick(now + NODE_WAIT);
         assert_eq!(names(&knowledge), [a, ("/b".to_owned(), None)]);
         // It was found before, so it need not wait again.
         knowledge.note_endpoints(now + NODE_WAIT, &writers(vec![silent]));
@@ -250,8 +283,21 @@ mod tests {
         let admissions = all.each_ref().map(|it| knowledge.admission(&it.id));
         assert_eq!(admissions, [Admission::Yes, Admission::No, Admission::Later]);
         assert_eq!(knowledge.admission(&[9; 16]), Admission::Later, "it may be found any moment");
+        knowledge.set_own(GuidPrefix([9; 12]));
+        assert_eq!(knowledge.admission(&[9; 16]), Admission::No, "its own");
         knowledge.note_endpoints(now, &writers(vec![all[2].clone()]));
         assert_eq!(knowledge.admission(&all[0].id), Admission::Later, "it is not known any more");
+    }
+
+    #[test]
+    fn nobody_waits_for_a_writer_that_cannot_be_read() {
+        let knowledge = Knowledge::new();
+        let mut keyed = found(1, "rt/a", TYPE);
+        keyed.id[15] = 0x02;
+        let other = found(2, "rt/a", "blaze::v1::Frame");
+        knowledge.note_endpoints(Instant::now(), &writers(vec![keyed.clone(), other.clone()]));
+        assert_eq!(knowledge.admission(&keyed.id), Admission::No);
+        assert_eq!(knowledge.admission(&other.id), Admission::No);
     }
 
     #[test]
@@ -264,7 +310,7 @@ mod tests {
             one
         });
         knowledge.note_endpoints(now, &writers(crowd.collect()));
-        knowledge.tick(now + NODE_WAIT, GuidPrefix([9; 12]));
+        knowledge.tick(now + NODE_WAIT);
         let network = Arc::clone(&knowledge.subscribe().borrow());
         assert_eq!((network.endpoints.len(), network.refused), (MAX_ENDPOINTS, 7));
     }

@@ -72,16 +72,16 @@ impl AllShown {
             *writer = None;
             return;
         }
-        let offered = inner.offered(name, &shown.type_name, shown.reliable);
+        let published = PublisherOptions {
+            reliable: shown.reliable,
+            depth: shown.durable.into(),
+            ..PublisherOptions::default()
+        };
+        let offered = inner.offered(name, &shown.type_name, published);
         if writer.as_ref().is_some_and(|(before, _)| *before == offered) {
             return;
         }
-        let options = PublisherOptions {
-            reliable: offered.reliable,
-            depth: u32::from(shown.durable),
-            ..PublisherOptions::default()
-        };
-        let made = inner.idle_writer(name, topic, &shown.type_name, offered.terms, options);
+        let made = inner.idle_writer(name, topic, &shown.type_name, offered);
         *writer = made.map(|made| (offered, made));
     }
 }

@@ -6,6 +6,7 @@ use blaze_domain::control::DEFAULT_ENCODING;
 use blaze_domain::{Durability, FlowId, MAX_PAYLOAD_BYTES, Reliability, Scope, TopicName};
 
 use crate::lane::path::{BareInfo, TopicInfo};
+use crate::plan::network::Servers;
 use crate::registry::{LeaseView, Registry, Terms};
 use crate::world::{FlowView, OriginFilter, TopicEntry};
 
@@ -38,6 +39,7 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
         max_bytes: offers().filter_map(|(_, bytes)| bytes).max(),
         rate_hz: offers().map(|(rate, _)| rate).sum::<Option<f64>>().filter(|_| !all.is_empty()),
         access: registry.access_of(topic),
+        servers: Servers::default(),
     }
 }
 

@@ -9,7 +9,7 @@ use blaze_domain::control::EventKind;
 use super::info::{Sources, announced_bytes, durable_sources, local_info};
 use super::routes::route_states;
 use super::{ControlCore, LATEST, Output, QUIET, event};
-use crate::plan::network::{self, Shown};
+use crate::plan::network::{self, Servers, Shown};
 use crate::plan::{Survey, TopicPlan, plan_within};
 use crate::registry::{MAX_ROUTES, carrying_states};
 use crate::world::OriginFilter;
@@ -28,6 +28,8 @@ struct Draft {
     is_known: bool,
     /// How it shows on the own ROS 2 network.
     shown: Option<Shown>,
+    /// Where its requests may go.
+    servers: Servers,
 }
 
 pub(super) struct Dirty {
@@ -103,13 +105,14 @@ impl ControlCore {
                 max_bytes: announced_bytes(&holders, topic),
                 is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
                 shown: network::shown(&survey, topic),
+                servers: network::servers(&survey, topic),
             }
         };
         topics.iter().map(draft).collect()
     }
 
     fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
-        let Draft { mut plan, durable, max_bytes, is_known, shown } = draft;
+        let Draft { mut plan, durable, max_bytes, is_known, shown, servers } = draft;
         self.show(topic, shown);
         let previous = self.plans.get(topic);
         if is_known
@@ -133,6 +136,7 @@ impl ControlCore {
         let duty = self.duty(now, topic, carried, &plan);
         let mut info = Box::new(local_info(&self.registry, topic));
         info.max_bytes = info.max_bytes.max(max_bytes);
+        info.servers = servers;
         if plan.bridges.is_empty() && !is_known {
             self.plans.remove(topic);
         } else {

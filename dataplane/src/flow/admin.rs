@@ -3,7 +3,7 @@
 
 mod allocation;
 mod peers;
-mod ros2;
+pub(super) mod ros2;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -11,9 +11,12 @@ use bytes::Bytes;
 
 use super::core::{DataConfig, DataCore};
 use super::measure::micros;
-use super::path::TopicId;
+use super::path::{TopicId, TopicPath};
 use super::reading::For;
 use super::window::DuplicateWindow;
+
+/// Clients of one service whose server is remembered.
+const MAX_CLIENTS: usize = 1024;
 
 /// Why a message is not taken in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -154,6 +157,7 @@ impl DataCore {
             let repeat = if born_here { DropReason::Duplicate } else { DropReason::Echo };
             return Err(repeat.into());
         }
+        let frame = if born_here { self.addressed(topic, frame)? } else { frame };
         let mut age_us = frame.age_us().saturating_add(waited_us);
         if from == Scope::Node && !bare {
             // One host, one clock: the publisher's time tells what nobody could measure.
@@ -165,6 +169,25 @@ impl DataCore {
         path.in_rate.add(now, bytes);
         let here_us = micros(now.saturating_duration_since(at));
         Ok(Admitted { kept, meant, ..Admitted::new(now, frame, born_here, age_us, here_us) })
+    }
+
+    /// A request to a service is for the flow of one server.
+    fn addressed(&mut self, topic: TopicId, frame: Frame) -> Result<Frame, DropReason> {
+        let TopicPath { info, clients, .. } = self.path_mut(topic);
+        if info.servers.is_empty() || !frame.to().is_empty() {
+            return Ok(frame);
+        }
+        let client = frame.writer();
+        let Some(server) = info.servers.choose(client, clients.get(&client)) else {
+            return Ok(frame);
+        };
+        let to = server.to_string();
+        if clients.len() >= MAX_CLIENTS {
+            // They are chosen again, mostly as before.
+            clients.clear();
+        }
+        clients.insert(client, server.clone());
+        frame.with_to(&to).map_err(|_| DropReason::TooLarge)
     }
 
     /// Gives a bare payload its header.

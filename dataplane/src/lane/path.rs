@@ -1,6 +1,6 @@
 //! One topic in one flow: its bridges and what is known of its messages.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 
 use blaze_domain::control::LeaseKind;
@@ -21,6 +21,7 @@ use super::writer::Writer;
 use crate::limit::gate::Gate;
 use crate::limit::size::SizeMeter;
 use crate::link::LaneId;
+use crate::plan::network::Servers;
 use crate::plan::{LaneSpec, Target};
 
 /// A topic, interned: its place in the data plane.
@@ -41,6 +42,8 @@ pub struct TopicInfo {
     pub rate_hz: Option<f64>,
     /// Whose messages are taken: the rules of `flow.access`.
     pub access: TopicAccess,
+    /// Where requests may go, if the topic is that of a service's requests.
+    pub servers: Servers,
 }
 
 /// What the advertisements of one scope say of messages that come without a header.
@@ -301,6 +304,8 @@ pub struct TopicPath {
     pub places: Places,
     /// Identity that the flow gives to bare messages, per source scope.
     pub bare: BTreeMap<Scope, (WriterId, u64)>,
+    /// Where the requests of each client go, if the topic is that of a service's requests.
+    pub(super) clients: HashMap<WriterId, FlowId>,
     /// Since when nobody has used it.
     pub(super) idle: Option<Instant>,
     /// It was forgotten: its place waits for another topic.
@@ -315,6 +320,7 @@ impl TopicPath {
             name,
             life,
             info: TopicInfo::default(),
+            clients: HashMap::new(),
             bridges: Vec::new(),
             largest_bytes: 0,
             compression: Compression::default(),

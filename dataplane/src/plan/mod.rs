@@ -398,6 +398,9 @@ impl<'w> Planner<'_, 'w> {
         let Some(publisher) = self.view.own_ros2_publisher() else {
             return;
         };
+        if self.view.serves_itself() {
+            return;
+        }
         for (to, own) in node_targets(self.view) {
             let lane = self.lanes.lane(self.view.pairs([publisher], [own]));
             self.put(Scope::Ros2, to, lane);

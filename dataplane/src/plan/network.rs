@@ -131,6 +131,59 @@ pub(crate) fn shown(survey: &Survey<'_>, topic: &TopicName) -> Option<Shown> {
     (!type_name.is_empty()).then_some(Shown { type_name, reliability, durability })
 }
 
+/// The flows whose networks have a server of a service, sorted; a client that one of these is on
+/// the network of needs none of them.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Servers {
+    /// Those of the own layer, which come first.
+    pub here: Vec<FlowId>,
+    /// Those of other layers.
+    pub elsewhere: Vec<FlowId>,
+}
+
+impl Servers {
+    /// The flow that a client's requests go to. `before`: where they went until now, which stays as
+    /// long as there is a server.
+    #[must_use]
+    pub fn choose(&self, client: WriterId, before: Option<&FlowId>) -> Option<&FlowId> {
+        let all = || self.here.iter().chain(&self.elsewhere);
+        let kept = before.and_then(|before| all().find(|flow| *flow == before));
+        let key = client.to_string();
+        kept.or_else(|| rendezvous::choose(&key, self.here.iter()))
+            .or_else(|| rendezvous::choose(&key, self.elsewhere.iter()))
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.here.is_empty() && self.elsewhere.is_empty()
+    }
+}
+
+/// The flows that requests of a topic may go to; none for other topics.
+pub(crate) fn servers(survey: &Survey<'_>, topic: &TopicName) -> Servers {
+    let world = survey.world;
+    let mut all = BTreeSet::new();
+    if is_request(topic) {
+        for (id, flow) in survey.holders(topic).into_iter().filter(|(id, _)| world.carries(id)) {
+            let Some(entry) = flow.topics.get(topic) else { continue };
+            all.extend((flow.ros2.is_some() && entry.ros2.request.is_some()).then(|| id.clone()));
+            // A gateway names the nodes of those that it speaks for.
+            let told = entry.layer.request.iter().flat_map(|request| &request.services);
+            all.extend(
+                told.filter_map(|of| Some(FlowId::new(id.layer.clone(), of.node.parse().ok()?))),
+            );
+        }
+    }
+    let (here, elsewhere) = all.into_iter().partition(|flow| flow.layer == world.me.layer);
+    Servers { here, elsewhere }
+}
+
+/// Whether messages of the topic are requests to a service.
+pub(super) fn is_request(topic: &TopicName) -> bool {
+    topic.as_str().rsplit('/').next() == Some("_request")
+}
+
 /// A flow that could own a writer of its network.
 pub type Candidate = (FlowId, Ipv4Addr);
 
@@ -239,6 +292,25 @@ mod tests {
         {
             assert_eq!(is_of_service(&name.parse().unwrap()), is_one, "{name}");
         }
+    }
+
+    #[test]
+    fn a_client_has_a_server_of_its_layer_and_stays_with_the_one_that_it_has() {
+        let flows = |names: &[&str]| names.iter().map(|name| id(name)).collect::<Vec<_>>();
+        let of = |here: &[&str], elsewhere: &[&str]| Servers {
+            here: flows(here),
+            elsewhere: flows(elsewhere),
+        };
+        assert_eq!(of(&[], &[]).choose(guid(1), Some(&id("f/a"))), None);
+        let far = of(&[], &["f/a", "f/b"]);
+        let mut chosen: Vec<&FlowId> = (0..40).filter_map(|n| far.choose(guid(n), None)).collect();
+        chosen.sort();
+        chosen.dedup();
+        assert_eq!(chosen.len(), 2, "different clients have different ones");
+        let near = of(&["e/x"], &["f/a", "f/b"]);
+        assert_eq!(near.choose(guid(1), None), Some(&id("e/x")));
+        assert_eq!(near.choose(guid(1), Some(&id("f/b"))), Some(&id("f/b")));
+        assert_eq!(near.choose(guid(1), Some(&id("f/gone"))), Some(&id("e/x")));
     }
 
     #[test]

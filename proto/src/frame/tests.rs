@@ -67,6 +67,22 @@ fn a_message_of_an_earlier_version_answers_nothing_and_is_for_any_flow() {
 }
 
 #[test]
+fn a_message_for_any_flow_is_addressed_and_stays_the_same_otherwise() {
+    let frame = Frame::new(&Header { to: String::new(), ..header() }, Bytes::from_static(b"x"));
+    let addressed = frame.unwrap().with_hops_and_age(2, 80).with_to("edge/robot-2").unwrap();
+    let expected =
+        Frame::new(&Header { hops: 2, age_us: 80, ..header() }, Bytes::from_static(b"x"));
+    let expected = expected.unwrap();
+    assert_eq!((addressed.to(), addressed.topic()), ("edge/robot-2", "imu/data"));
+    assert_eq!((addressed.hops(), addressed.age_us()), (2, 80));
+    assert_eq!(
+        (addressed.related(), addressed.payload()),
+        (expected.related(), expected.payload())
+    );
+    assert!(addressed.with_to(&"x".repeat(MAX_HEADER_BYTES)).is_err());
+}
+
+#[test]
 fn hops_and_age_are_written_anew_and_the_rest_stays() {
     let frame = Frame::new(&header(), Bytes::from_static(b"p")).unwrap();
     let written = frame.clone().with_hops_and_age(2, 1_000_000).to_bytes();

@@ -46,7 +46,8 @@ impl Generation {
         let farewell =
             Farewell::new(shared.address, participant.port()).map_err(create_error("socket"))?;
         let near = Near::of_interface(shared.address);
-        let presence = Arc::new(Mutex::new(Presence::new(near)));
+        let presence =
+            Arc::new(Mutex::new(Presence::new(near, shared.dialect.sign_topic().is_some())));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
             watch: participant.watch_endpoints(
@@ -172,7 +173,6 @@ impl Generation {
 fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
     let mut offered: HashMap<String, [bool; 3]> = HashMap::new();
-    shared.dialect.note_endpoints(endpoints);
     let signs = shared.dialect.sign_topic();
     let sign =
         |writer: &FoundEndpoint| (Some(&*writer.topic) == signs).then(|| writer.participant());
@@ -194,6 +194,10 @@ fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpo
     let changed = *shared.offered.read() != offered;
     if changed {
         *shared.offered.write() = offered;
+    }
+    // Last: readers that are wanted because of it are made for what is offered now.
+    shared.dialect.note_endpoints(endpoints);
+    if changed {
         shared.wake_lifecycle();
     }
 }

@@ -91,6 +91,11 @@ impl Shared {
         })
     }
 
+    /// What a writer offers, if it is known.
+    pub(super) fn facts_of(&self, writer: &EndpointId) -> Option<WriterFacts> {
+        self.writers.read().get(writer).copied()
+    }
+
     /// What is known of a writer's clock.
     pub(super) fn clock_of(&self, writer: EndpointId, facts: Option<WriterFacts>) -> Clock {
         if facts.is_some_and(|facts| facts.own) {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::{DropReason, WriterId};
 use parking_lot::Mutex;
 
-use super::{Encoded, Topic};
+use super::Topic;
 use crate::dds::{Profile, Writer, Written};
 
 /// How long a new writer waits for its first reader: discovery takes that long where there is one.
@@ -16,6 +16,8 @@ const MEET: Duration = Duration::from_millis(300);
 /// How long after the first reader was found samples may not reach it, since it has not found the
 /// writer.
 const SETTLE: Duration = Duration::from_millis(20);
+/// How long a writer stands before it takes over from another: the readers have found it by then.
+const STANDS: Duration = Duration::from_millis(100);
 /// How long a writer stays after its last user at least, and at most while readers have not
 /// acknowledged.
 const LINGER: Duration = Duration::from_millis(300);
@@ -101,7 +103,7 @@ impl Slot {
     pub(super) fn write(
         &self,
         now: Instant,
-        encode: impl FnOnce() -> Result<Encoded, DropReason>,
+        write: impl FnOnce(&Writer) -> Result<Written, DropReason>,
     ) -> Attempt {
         let mut state = self.state.lock();
         let state = &mut *state;
@@ -120,20 +122,17 @@ impl Slot {
             }
             state.settled = true;
         }
-        let encoded = match encode() {
-            Ok(encoded) => encoded,
-            Err(reason) => return Attempt::Dropped(reason),
-        };
-        match writer.write_cdr(encoded.cdr, encoded.options) {
-            Written::Taken(_) | Written::NoReader => {
+        match write(writer) {
+            Ok(Written::Taken(_) | Written::NoReader) => {
                 state.full_since = None;
                 Attempt::Done
             }
-            Written::Full => {
+            Ok(Written::Full) => {
                 state.full_since.get_or_insert(now);
                 Attempt::NotNow
             }
-            Written::Failed => Attempt::Dropped(DropReason::BrokerError),
+            Ok(Written::Failed) => Attempt::Dropped(DropReason::BrokerError),
+            Err(reason) => Attempt::Dropped(reason),
         }
     }
 
@@ -144,6 +143,14 @@ impl Slot {
     pub(super) fn put(&self, writer: Writer, now: Instant) {
         *self.state.lock() =
             State { writer: Some(Arc::new(writer)), made: Some(now), ..State::default() };
+    }
+
+    /// Whether its writer stands, and has met so many readers, where that takes less than `limit`.
+    pub(super) fn has_met(&self, readers: usize, now: Instant, limit: Duration) -> bool {
+        let state = self.state.lock();
+        let (Some(writer), Some(made)) = (&state.writer, state.made) else { return false };
+        let age = now.saturating_duration_since(made);
+        age >= limit || (age >= STANDS && writer.has_met(readers))
     }
 
     /// Since when its window has been full.

@@ -27,6 +27,19 @@ impl<'w> TopicView<'w> {
         Some(Requester { flow, group, scope: Scope::Ros2, network, request })
     }
 
+    /// Whether the own network has a server of the service that this topic's requests go to: its
+    /// clients need no other one.
+    pub(crate) fn serves_itself(&self) -> bool {
+        let own = self.world.flows.get_key_value(self.me);
+        let network = own.and_then(|(id, view)| Network::of(id, view));
+        let flows = network.and_then(|network| self.networks.get(&network));
+        let has_server = |flow: &&FlowId| {
+            let entry = self.world.flows.get(*flow).and_then(|view| view.topics.get(self.topic));
+            entry.is_some_and(|entry| entry.ros2.request.is_some())
+        };
+        network::is_request(self.topic) && flows.into_iter().flatten().any(has_server)
+    }
+
     /// Flows on the own network.
     pub(crate) fn natives(&self) -> Natives {
         if network::is_of_service(self.topic) {

@@ -1,0 +1,328 @@
+//! Which request of a service a reply answers.
+//!
+//! ```text
+//! client ──request──► its flow ──► flow of the server ──request──► server
+//!    ▲                asked                forwarded                 │
+//!    └─────reply───── its flow ◄── flow of the server ◄────reply─────┘
+//! ```
+//!
+//! Each implementation of DDS has its own way to tell: Fast DDS and others send the identity of the
+//! request beside the reply, Cyclone has 16 bytes before the CDR. Between flows there is neither:
+//! a reply names writer and number of the request.
+
+use std::collections::{BTreeMap, HashMap};
+
+use blaze_domain::WriterId;
+use bytes::{BufMut, Bytes, BytesMut};
+use parking_lot::Mutex;
+use rustdds::rpc::SampleIdentity;
+use rustdds::{GUID, SequenceNumber};
+
+use super::endpoint::Vendor;
+use super::names::Carries;
+use crate::dds::{EndpointId, Sample};
+
+/// Requests of one client that wait for their replies; then the oldest is given up.
+const MAX_OF_CLIENT: usize = 1024;
+/// The same of all clients together.
+const MAX_REQUESTS: usize = 65_536;
+/// Bytes of the encapsulation, and of what Cyclone puts before requests and replies: who asks, and
+/// the number of the request.
+const ENCAPSULATION: usize = 4;
+const CYCLONE_HEADER: usize = 16;
+
+/// A request: its client's writer, and its number.
+pub(super) type Request = (WriterId, u64);
+
+/// How a client or server knows a request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum OnWire {
+    /// As RTPS tells beside a sample: a reader or writer, and a number.
+    Related(EndpointId, i64),
+    /// As Cyclone tells before the CDR.
+    Header([u8; CYCLONE_HEADER]),
+}
+
+/// What a DDS topic of ROS 2 carries.
+pub(super) fn carries(dds_topic: &str) -> Carries {
+    match dds_topic.get(..3) {
+        Some("rq/") => Carries::Requests,
+        Some("rr/") => Carries::Replies,
+        _ => Carries::Messages,
+    }
+}
+
+impl OnWire {
+    /// How the client of this vendor knows its request, and the request as others send it. `None`
+    /// where it is too short.
+    pub(super) fn of_request(vendor: Vendor, sample: &Sample) -> Option<(Self, Bytes)> {
+        let payload = sample.sample.payload();
+        if vendor == Vendor::CycloneDds {
+            return cut_header(payload).map(|(header, rest)| (Self::Header(header), rest));
+        }
+        // Fast DDS looks for its reader of replies, if the request names that.
+        let named = sample.related_sample_identity().map(|related| related.writer_guid);
+        let named = named.filter(|guid| *guid != GUID::GUID_UNKNOWN);
+        let guid = named.unwrap_or(sample.writer_guid);
+        Some((Self::Related(guid.to_bytes(), sample.sequence_number.into()), payload.clone()))
+    }
+
+    /// Which of our requests a server of this vendor answers, and the reply as others send it.
+    pub(super) fn of_reply(vendor: Vendor, sample: &Sample) -> Option<(Self, Bytes)> {
+        let payload = sample.sample.payload();
+        if vendor == Vendor::CycloneDds {
+            return cut_header(payload).map(|(header, rest)| (Self::Header(header), rest));
+        }
+        let related = sample.related_sample_identity()?;
+        let number = related.sequence_number.into();
+        Some((Self::Related(related.writer_guid.to_bytes(), number), payload.clone()))
+    }
+
+    /// A sample that says so: its payload, and its related identity.
+    pub(super) fn put_on(self, payload: &Bytes) -> (Bytes, Option<SampleIdentity>) {
+        match self {
+            Self::Related(guid, number) => {
+                let writer_guid = GUID::from_bytes(guid);
+                let sequence_number = SequenceNumber::from(number);
+                (payload.clone(), Some(SampleIdentity { writer_guid, sequence_number }))
+            }
+            Self::Header(header) => {
+                let at = ENCAPSULATION.min(payload.len());
+                let mut bytes = BytesMut::with_capacity(payload.len() + CYCLONE_HEADER);
+                bytes.put_slice(&payload[..at]);
+                bytes.put_slice(&header);
+                bytes.put_slice(&payload[at..]);
+                (bytes.freeze(), None)
+            }
+        }
+    }
+}
+
+/// What stands before the CDR, and the sample without it: 16 bytes, so alignment stays.
+fn cut_header(payload: &Bytes) -> Option<([u8; CYCLONE_HEADER], Bytes)> {
+    let (encapsulation, body) = payload.split_at_checked(ENCAPSULATION)?;
+    let (header, rest) = body.split_first_chunk::<CYCLONE_HEADER>()?;
+    let mut bytes = BytesMut::with_capacity(ENCAPSULATION + rest.len());
+    bytes.put_slice(encapsulation);
+    bytes.put_slice(rest);
+    Some((*header, bytes.freeze()))
+}
+
+/// Something for each of some requests, bounded by client.
+#[derive(Debug)]
+struct ByRequest<V> {
+    all: BTreeMap<Request, V>,
+    of_client: HashMap<WriterId, usize>,
+}
+
+impl<V> Default for ByRequest<V> {
+    fn default() -> Self {
+        Self { all: BTreeMap::new(), of_client: HashMap::new() }
+    }
+}
+
+impl<V> ByRequest<V> {
+    /// Puts in one. Returns those that gave way: the same before, and the oldest of its client.
+    fn insert(&mut self, request: Request, value: V) -> Vec<V> {
+        let mut gone: Vec<V> = self.remove(&request).into_iter().collect();
+        let count = self.of_client.get(&request.0).copied().unwrap_or(0);
+        if count >= MAX_OF_CLIENT {
+            let of_client = (request.0, 0)..=(request.0, u64::MAX);
+            let oldest = self.all.range(of_client).next().map(|(oldest, _)| *oldest);
+            gone.extend(oldest.and_then(|oldest| self.remove(&oldest)));
+        } else if self.all.len() >= MAX_REQUESTS {
+            let other = self.all.keys().next().copied();
+            gone.extend(other.and_then(|other| self.remove(&other)));
+        }
+        *self.of_client.entry(request.0).or_default() += 1;
+        self.all.insert(request, value);
+        gone
+    }
+
+    fn remove(&mut self, request: &Request) -> Option<V> {
+        let value = self.all.remove(request)?;
+        if let Some(count) = self.of_client.get_mut(&request.0) {
+            *count -= 1;
+            if *count == 0 {
+                self.of_client.remove(&request.0);
+            }
+        }
+        Some(value)
+    }
+
+    /// Forgets all requests of some clients. Returns what they had.
+    fn retain(&mut self, keeps: impl Fn(&Request, &V) -> bool) -> Vec<V> {
+        let gone: Vec<Request> = self
+            .all
+            .iter()
+            .filter(|(request, value)| !keeps(request, value))
+            .map(|it| *it.0)
+            .collect();
+        gone.iter().filter_map(|request| self.remove(request)).collect()
+    }
+}
+
+/// A request that was written here for a client elsewhere.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Forwarded {
+    pub(super) request: Request,
+    /// The flow of its client.
+    pub(super) flow: String,
+}
+
+/// The requests that wait for replies.
+#[derive(Default)]
+pub(super) struct Services {
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+pub(super) struct State {
+    /// Of clients on this network: how they know their requests.
+    asked: ByRequest<OnWire>,
+    /// Written here for clients elsewhere: how the server knows them, and on which DDS topic.
+    forwarded: ByRequest<(OnWire, String)>,
+    by_wire: HashMap<OnWire, Forwarded>,
+    /// Requests that were given up because there were too many.
+    given_up: u64,
+    /// The last number given to a server that wants one before the CDR.
+    last: u64,
+}
+
+impl Services {
+    /// To be held from before a request is written until it is [noted](State::note_forwarded): its
+    /// reply may be read by then.
+    pub(super) fn lock(&self) -> parking_lot::MutexGuard<'_, State> {
+        self.state.lock()
+    }
+}
+
+impl State {
+    /// A client on this network asks.
+    pub(super) fn note_asked(&mut self, request: Request, known_as: OnWire) {
+        self.given_up += self.asked.insert(request, known_as).len() as u64;
+    }
+
+    /// How the client of a request knows it; `None`: it is not waited for any more.
+    pub(super) fn asked(&self, request: &Request) -> Option<OnWire> {
+        self.asked.all.get(request).copied()
+    }
+
+    /// The reply has been written.
+    pub(super) fn note_answered(&mut self, request: &Request) {
+        self.asked.remove(request);
+    }
+
+    /// A number that no request had before, for a server that wants one before the CDR. `own`: the
+    /// writer of requests.
+    pub(super) fn next_header(&mut self, own: &EndpointId) -> OnWire {
+        self.last += 1;
+        let mut header = [0; CYCLONE_HEADER];
+        header[..8].copy_from_slice(&own[..8]);
+        // The same participant may have several writers of one service.
+        header[4..8].copy_from_slice(&own[12..]);
+        header[8..].copy_from_slice(&self.last.to_le_bytes());
+        OnWire::Header(header)
+    }
+
+    /// A request was written here.
+    pub(super) fn note_forwarded(&mut self, topic: &str, known_as: OnWire, of: Forwarded) {
+        let gone = self.forwarded.insert(of.request, (known_as, topic.to_owned()));
+        self.given_up += gone.len() as u64;
+        self.forget(gone);
+        self.by_wire.insert(known_as, of);
+    }
+
+    /// Takes the request that a server answers.
+    pub(super) fn take_forwarded(&mut self, known_as: &OnWire) -> Option<Forwarded> {
+        let forwarded = self.by_wire.remove(known_as)?;
+        self.forwarded.remove(&forwarded.request);
+        Some(forwarded)
+    }
+
+    /// Forgets requests whose clients have gone, and those whose servers have: of no service whose
+    /// requests are read.
+    pub(super) fn retain(
+        &mut self,
+        is_client: impl Fn(&WriterId) -> bool,
+        is_served: impl Fn(&str) -> bool,
+    ) {
+        self.asked.retain(|(client, _), _| is_client(client));
+        let gone = self.forwarded.retain(|_, (_, topic)| is_served(topic));
+        self.forget(gone);
+    }
+
+    /// Requests that wait for replies, and those that were given up.
+    pub(super) fn counts(&self) -> (usize, u64) {
+        (self.asked.all.len() + self.forwarded.all.len(), self.given_up)
+    }
+
+    fn forget(&mut self, gone: Vec<(OnWire, String)>) {
+        for (known_as, _) in gone {
+            self.by_wire.remove(&known_as);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CLIENT: WriterId = WriterId([1; 16]);
+
+    fn forwarded(number: u64) -> Forwarded {
+        Forwarded { request: (CLIENT, number), flow: "edge/a".to_owned() }
+    }
+
+    #[test]
+    fn what_stands_before_the_cdr_is_taken_off_and_put_on() {
+        let plain = Bytes::from_static(&[0, 1, 0, 0, 9, 8, 7, 6]);
+        let header = [5; CYCLONE_HEADER];
+        let (with, related) = OnWire::Header(header).put_on(&plain);
+        assert_eq!((with.len(), related), (24, None));
+        assert_eq!(cut_header(&with), Some((header, plain.clone())));
+        assert_eq!(cut_header(&plain), None);
+        let (same, related) = OnWire::Related([3; 16], 7).put_on(&plain);
+        let related = related.unwrap();
+        assert_eq!(same, plain);
+        assert_eq!(
+            (related.writer_guid.to_bytes(), i64::from(related.sequence_number)),
+            ([3; 16], 7)
+        );
+    }
+
+    #[test]
+    fn each_reply_finds_its_request_once() {
+        let mut state = State::default();
+        let wire = |number| OnWire::Related([9; 16], number);
+        for number in 1..=3_u64 {
+            state.note_forwarded("rq/addRequest", wire(number as i64), forwarded(number));
+        }
+        assert_eq!(state.take_forwarded(&wire(2)), Some(forwarded(2)));
+        assert_eq!(state.take_forwarded(&wire(2)), None, "a server may answer once");
+        assert_eq!(state.take_forwarded(&OnWire::Related([8; 16], 1)), None);
+        let headers = [state.next_header(&[7; 16]), state.next_header(&[7; 16])];
+        assert_ne!(headers[0], headers[1]);
+        assert_eq!(state.counts(), (2, 0));
+        state.retain(|_| true, |topic| topic != "rq/addRequest");
+        assert_eq!(state.counts(), (0, 0), "the server has gone");
+        assert_eq!(state.take_forwarded(&wire(1)), None);
+    }
+
+    #[test]
+    fn of_too_many_requests_of_a_client_the_oldest_is_given_up() {
+        let mut state = State::default();
+        for number in 1..=MAX_OF_CLIENT as u64 + 2 {
+            state.note_asked((CLIENT, number), OnWire::Related([1; 16], 1));
+        }
+        assert_eq!(state.counts(), (MAX_OF_CLIENT, 2));
+        assert_eq!(state.asked(&(CLIENT, 2)), None);
+        assert!(state.asked(&(CLIENT, 3)).is_some(), "until its reply is written");
+        state.note_answered(&(CLIENT, 3));
+        assert_eq!(state.asked(&(CLIENT, 3)), None);
+        state.note_asked((WriterId([2; 16]), 1), OnWire::Related([2; 16], 1));
+        state.retain(|client| *client != CLIENT, |_| true);
+        assert_eq!(state.counts(), (1, 2), "the client has gone");
+        assert_eq!(state.asked.of_client.len(), 1);
+    }
+}
