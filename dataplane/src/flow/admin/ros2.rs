@@ -3,17 +3,20 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use axum::extract::State;
+use axum::extract::{Query, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use blaze_brokers::{Broker as _, Health};
+use blaze_convert::definition_text;
 use blaze_domain::control::LeaseKind;
 use blaze_domain::{Scope, TopicName, WriterId};
 use serde_json::{Value, json};
 
-use super::super::ros2::{Refusal, Seen};
-use super::{App, answer, refusal};
+use super::super::Shared;
+use super::super::ros2::{Refusal, Ros2Scope, Seen};
+use super::{App, answer, query_text, refusal};
 use crate::control::ControlCore;
+use crate::types::MessageType;
 use crate::world::TopicEntry;
 
 pub(super) async fn ros2(State(shared): App) -> Response {
@@ -21,6 +24,13 @@ pub(super) async fn ros2(State(shared): App) -> Response {
         let detail = "this flow is on no ROS 2 network: its node file has no brokers.plugins ros2";
         return refusal(StatusCode::NOT_FOUND, "not_found", detail);
     };
+    let seen = ros2.seen();
+    let answers = network(&shared, ros2, &seen);
+    let answers = with_types(&shared, answers, &seen).await;
+    answer(&shared, answers).into_response()
+}
+
+fn network(shared: &Shared, ros2: &Ros2Scope, seen: &[Seen]) -> Value {
     let network = Arc::clone(&ros2.broker.network().borrow());
     let status = ros2.broker.status().borrow().clone();
     let control = shared.control.lock();
@@ -39,16 +49,60 @@ pub(super) async fn ros2(State(shared): App) -> Response {
             detail = format!("{detail}; {count} {what}");
         }
     }
-    let seen = ros2.seen();
-    let endpoints: Vec<Value> = rows(&seen, &control).iter().map(Row::json).collect();
-    let answers = json!({
+    let endpoints: Vec<Value> = rows(seen, &control).iter().map(Row::json).collect();
+    json!({
         "domain": ros2.domain, "interface": ros2.interface, "state": state, "detail": detail,
         "guid_prefix": network.own.map(|own| own.to_string()), "node": shared.me.ros2_node(),
         "participants": network.participants, "endpoints": endpoints,
         "calls": {"pending": ros2.broker.requests().0},
+    })
+}
+
+/// Adds the types of the endpoints, and where their definitions come from.
+async fn with_types(shared: &Arc<Shared>, mut answers: Value, seen: &[Seen]) -> Value {
+    let of_endpoint = |seen: &Seen| {
+        let endpoint = &seen.endpoint;
+        let name = endpoint.type_name.clone()?;
+        Some(MessageType { name, hash: endpoint.type_hash.clone().unwrap_or_default() })
+    };
+    let names: BTreeSet<_> = seen.iter().filter_map(of_endpoint).collect();
+    let types = Arc::clone(&shared.types);
+    let found = move || {
+        let row = |of: &MessageType| {
+            let found = types.find(of.borrowed());
+            let source = found.map_or("none", |found| found.source.as_str());
+            let hash = Some(&of.hash).filter(|hash| !hash.is_empty());
+            json!({"type": of.name, "hash": hash, "source": source})
+        };
+        names.iter().map(row).collect::<Vec<_>>()
+    };
+    // Files may be read.
+    let found = tokio::task::spawn_blocking(found).await;
+    answers["types"] = json!(found.unwrap_or_default());
+    answers
+}
+
+/// `GET /v1/ros2/types?type=pkg/msg/Name`: the definition of a type.
+pub(super) async fn types(State(shared): App, query: Query<BTreeMap<String, String>>) -> Response {
+    let Some(name) = query_text(&query, "type").filter(|name| !name.is_empty()) else {
+        let detail = "the parameter type is missing: /v1/ros2/types?type=sensor_msgs/msg/Imu";
+        return refusal(StatusCode::BAD_REQUEST, "invalid_request", detail);
+    };
+    let types = Arc::clone(&shared.types);
+    let sought = MessageType { name: name.clone(), hash: String::new() };
+    let found = tokio::task::spawn_blocking(move || types.find(sought.borrowed())).await;
+    let Some(found) = found.ok().flatten() else {
+        let detail = format!(
+            "no definition of {name}: it is not built in, nor in a folder of brokers.plugins ros2 \
+             interfaces"
+        );
+        return refusal(StatusCode::NOT_FOUND, "type_unknown", &detail);
+    };
+    let body = json!({
+        "type": name, "hash": found.hash.to_string(), "source": found.source.as_str(),
+        "definition": definition_text(&found.description),
     });
-    drop(control);
-    answer(&shared, answers).into_response()
+    answer(&shared, body).into_response()
 }
 
 /// What the rows of one topic's endpoints need to know of it. Of pairs the first one is for what is

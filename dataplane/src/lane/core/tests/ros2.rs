@@ -62,7 +62,7 @@ fn a_request_goes_to_one_server_and_stays_with_it() {
         servers: Servers { here: flows(here), elsewhere: flows(elsewhere) },
         ..TopicInfo::default()
     };
-    let mut ask = |bench: &mut Bench, sequence| {
+    let ask = |bench: &mut Bench, sequence| {
         let before = bench.link.submitted.len();
         bench.take(Scope::Ros2, vec![Content::Frame(frame(1, sequence, "robot-1", 0, 1))]);
         bench.link.submitted.len() - before
