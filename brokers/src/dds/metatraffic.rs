@@ -11,7 +11,8 @@
 //!
 //! RustDDS gets the announcements of others from here alone: the packet filter cuts off those that
 //! come by multicast, and the kernel steers those that come to RustDDS' own port here. All other
-//! metatraffic of others, and all user data, go directly.
+//! metatraffic of others, and all user data, go directly. At the end the good-bye of RustDDS is
+//! repeated as Fast DDS takes it: for the reader of announcements, not for any reader.
 
 mod message;
 
@@ -30,7 +31,7 @@ use socket2::{Domain, SockRef, Socket, Type};
 
 use super::filter::{FilterError, keep_announcements, steer};
 use super::reader::StoppableThread;
-use super::{DdsError, GuidPrefix, create_error, multicast_port};
+use super::{DdsError, GuidPrefix, create_error, farewell, multicast_port};
 use message::{Outgoing, Spdp};
 
 /// Where participants announce themselves.
@@ -44,6 +45,8 @@ const MAX_ADDRESSES: usize = 4;
 const SILENCE: Duration = Duration::from_secs(120);
 /// How soon the end is noticed, and silence looked for.
 const LISTEN: u8 = 50;
+/// Number of the good-bye.
+const FAREWELL: u32 = u32::MAX;
 /// Datagrams that are taken of one socket before the others have their turn.
 const AT_ONCE: usize = 64;
 /// For bursts: RustDDS sends all readers and writers at once.
@@ -131,6 +134,8 @@ impl Metatraffic {
                 worker.turn(Instant::now());
             }
             worker.turn(Instant::now());
+            // RustDDS has not counted as far, so it is new.
+            worker.send(&farewell::datagram(own, FAREWELL));
         })?;
         Ok(Self { dropped, _thread: thread })
     }
@@ -166,7 +171,7 @@ impl Worker {
 
     fn turn(&mut self, now: Instant) {
         let mut buffer = std::mem::take(&mut self.buffer);
-        for (take, at) in [(Self::announce as Take, 0), (Self::announce, 1), (Self::send, 2)] {
+        for at in 0..self.sockets.all().len() {
             for _ in 0..AT_ONCE {
                 let (length, from) = match self.sockets.all()[at].recv_from(&mut buffer) {
                     Ok((length, SocketAddr::V4(from))) => (length, from),
@@ -174,7 +179,13 @@ impl Worker {
                     // An error of what was sent shows here, too.
                     _ => continue,
                 };
-                if take(self, &buffer[..length], from, now).is_none() {
+                let datagram = &buffer[..length];
+                let done = match at {
+                    2 if from == self.sockets.here => None,
+                    2 => self.send(datagram),
+                    _ => self.announce(datagram, *from.ip(), now),
+                };
+                if done.is_none() {
                     self.dropped.fetch_add(1, Ordering::Relaxed);
                 }
             }
@@ -184,9 +195,9 @@ impl Worker {
     }
 
     /// Repeats an announcement to RustDDS.
-    fn announce(&mut self, datagram: &[u8], from: SocketAddrV4, now: Instant) -> Option<()> {
+    fn announce(&mut self, datagram: &[u8], from: Ipv4Addr, now: Instant) -> Option<()> {
         let spdp = Spdp::parse(datagram)?;
-        let is_kept = spdp.prefix != self.own && self.note(&spdp, *from.ip(), now);
+        let is_kept = spdp.prefix != self.own && self.note(&spdp, from, now);
         // RustDDS learns from datagrams of a participant whether it is on this host. On loopback
         // all are; elsewhere what is sent from here must not tell.
         let sender = (!self.sockets.here.ip().is_loopback()).then_some(self.own);
@@ -214,10 +225,7 @@ impl Worker {
     }
 
     /// Sends on what RustDDS sends.
-    fn send(&mut self, datagram: &[u8], from: SocketAddrV4, _: Instant) -> Option<()> {
-        if from == self.sockets.here {
-            return None;
-        }
+    fn send(&self, datagram: &[u8]) -> Option<()> {
         let outgoing = Outgoing::amend(datagram, self.own)?;
         let is_meant = |it: &GuidPrefix| outgoing.to.is_empty() || outgoing.to.contains(it);
         let meant = self.participants.iter().filter(|(prefix, _)| is_meant(prefix));
@@ -231,5 +239,3 @@ impl Worker {
         self.sockets.metatraffic.send_to(datagram, to).ok().map(|_| ())
     }
 }
-
-type Take = fn(&mut Worker, &[u8], SocketAddrV4, Instant) -> Option<()>;

@@ -151,8 +151,8 @@ pub(super) struct Outgoing<'a> {
 }
 
 impl<'a> Outgoing<'a> {
-    /// Adds the hashes of keys where something ceases. RustDDS sends the key itself, of which Fast
-    /// DDS takes no notice. `None` for what is not of `own`, and for what is malformed.
+    /// Adds the hashes of keys where something ceases. `None` for what is not of `own`, and for what
+    /// is malformed.
     pub(super) fn amend(datagram: &'a [u8], own: GuidPrefix) -> Option<Self> {
         let message = Message::parse(datagram).filter(|it| it.prefix() == own)?;
         let mut to = Vec::new();
