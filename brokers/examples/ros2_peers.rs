@@ -5,6 +5,7 @@
 //! ros2_peers DOMAIN late SECONDS      joins rt/counter as a reliable, volatile reader; the first and last sample, gaps
 //! ros2_peers DOMAIN serve SECONDS     answers rq/basic_typesRequest, with the identity of the request in the reply
 //! ros2_peers DOMAIN call COUNT        calls rq/basic_typesRequest and looks for its identity in the replies
+//! ros2_peers DOMAIN gone COUNT         has a server of /basic_types for a second, and none for two, COUNT times
 //! ros2_peers DOMAIN watch SECONDS     prints the endpoints of others
 //! ros2_peers DOMAIN adapter SECONDS   rt/big -> rt/big_reply through the adapter, and prints what it knows of others
 //! ```
@@ -16,7 +17,7 @@ use std::collections::hash_map::Entry;
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::dds::{
     Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer, Written,
@@ -37,7 +38,7 @@ type Error = Box<dyn std::error::Error>;
 fn main() -> Result<(), Error> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [domain, task, count] = &arguments[..] else {
-        return Err("usage: ros2_peers DOMAIN echo|late|serve|call|watch SECONDS|COUNT".into());
+        return Err("usage: ros2_peers DOMAIN echo|late|serve|call|gone|watch SECONDS|COUNT".into());
     };
     if task == "adapter" {
         let runtime = tokio::runtime::Runtime::new()?;
@@ -55,6 +56,7 @@ fn main() -> Result<(), Error> {
         "late" => late(&participant, Duration::from_secs(count))?,
         "serve" => serve(&participant, Duration::from_secs(count))?,
         "call" => call(&participant, count)?,
+        "gone" => gone(&participant, count)?,
         "watch" => watch(&participant, Duration::from_secs(count))?,
         other => return Err(format!("unknown task {other}").into()),
     }
@@ -173,6 +175,24 @@ fn serve(participant: &Participant, time: Duration) -> Result<(), Error> {
     }
     println!("{served} requests answered");
     Ok(())
+}
+
+/// A server whose coming and going clients see (`service_is_ready`).
+fn gone(participant: &Participant, count: u64) -> Result<(), Error> {
+    for _ in 0..count {
+        let reader = read(participant, ("rq/basic_typesRequest", REQUEST), reliable(64))?;
+        let writer = participant.typed_writer(("rr/basic_typesReply", REPLY), reliable(64))?;
+        println!("{:.3} there", now_seconds());
+        std::thread::sleep(Duration::from_secs(1));
+        drop((reader, writer));
+        println!("{:.3} gone", now_seconds());
+        std::thread::sleep(Duration::from_secs(2));
+    }
+    Ok(())
+}
+
+fn now_seconds() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
 
 fn call(participant: &Participant, count: u64) -> Result<(), Error> {

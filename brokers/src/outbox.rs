@@ -216,10 +216,20 @@ pub(crate) struct Outbox<C> {
     filled: Notify,
 }
 
+/// Tells whether messages of a lane still wait.
+pub(crate) struct Backlog(Arc<Counts>);
+
+impl Backlog {
+    pub(crate) fn is_empty(&self) -> bool {
+        self.0.0.lock().queued == 0
+    }
+}
+
 /// One publisher's queue.
 pub(crate) struct Lane<C> {
     outbox: Arc<Outbox<C>>,
     id: u64,
+    to: Arc<C>,
     counts: Arc<Counts>,
     /// How long a message may wait at most, whatever its deadline.
     longest_wait: Option<Duration>,
@@ -243,20 +253,21 @@ impl<C> Outbox<C> {
     /// A queue for a publisher. What waits longer than `longest_wait` is dropped as `broker_error`.
     pub(crate) fn lane(self: &Arc<Self>, to: C, longest_wait: Option<Duration>) -> Lane<C> {
         let counts = Arc::<Counts>::default();
+        let to = Arc::new(to);
         let mut state = self.state.lock();
         let id = state.next;
         state.next += 1;
         let queue = Queue {
             entries: VecDeque::new(),
             bytes: 0,
-            to: Arc::new(to),
+            to: Arc::clone(&to),
             counts: Arc::clone(&counts),
             has_turn: false,
             orphaned: false,
         };
         state.lanes.insert(id, queue);
         drop(state);
-        Lane { outbox: Arc::clone(self), id, counts, longest_wait }
+        Lane { outbox: Arc::clone(self), id, to, counts, longest_wait }
     }
 
     /// Waits until there is a lane that held nothing when it was last looked at. Who leaves
@@ -435,6 +446,15 @@ impl<C> Lane<C> {
         }
         self.outbox.filled.notify_one();
         PublishOutcome::Taken
+    }
+
+    /// What the lane is for.
+    pub(crate) fn to(&self) -> &C {
+        &self.to
+    }
+
+    pub(crate) fn backlog(&self) -> Backlog {
+        Backlog(Arc::clone(&self.counts))
     }
 
     /// What became of what was pushed.

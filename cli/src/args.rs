@@ -41,6 +41,8 @@ pub enum Command {
     Bridges(FlowTarget),
     /// Other flows that a flow sees
     Peers(FlowTarget),
+    /// Endpoints of a flow's ROS 2 network, and why one is not bridged
+    Ros2(FlowTarget),
     /// What each lane carries beside what it was allocated, once a second
     Top(TopOptions),
     /// Why a topic does or does not arrive; exits with 0 if it flows

@@ -65,6 +65,7 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
     let format = output.format();
     match arguments.command {
         Command::Topics(target) => admin::topics(&target.flow, format?).await,
+        Command::Ros2(target) => admin::ros2(&target.flow, format?).await,
         Command::Bridges(target) => admin::bridges(&target.flow, format?).await,
         Command::Peers(target) => admin::peers(&target.flow, format?).await,
         Command::Top(options) => admin::top(&options, format?).await,

@@ -7,10 +7,12 @@ import tempfile
 import time
 import zipfile
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import node_tools
 import python_tools
+import ros
 import servers
 from common import DOWNLOADS, HOME, TEMPLATES, Failure, Pin, pins, run, say, sha256
 
@@ -225,24 +227,43 @@ def format_kafka(libraries: Path) -> None:
 
 def python() -> str:
     """Into a folder of their own; no virtual environment is needed, which some systems install without pip."""
-    wheels, new = DOWNLOADS / "python", HOME / "python.new"
-    pip = ["python3", "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-cache-dir"]
-    options = ["--only-binary=:all:", "--require-hashes", "--requirement", python_tools.LOCK]
-    install = [*pip, "install", *options, "--no-deps", "--no-index", "--find-links", wheels, "--target", new]
+    new = HOME / "python.new"
+    clear = partial(shutil.rmtree, new, ignore_errors=True)
+    clear()
+    locked_packages(python_tools.LOCK, DOWNLOADS / "python", clear, target=("--target", new))
+    shutil.rmtree(python_tools.FOLDER, ignore_errors=True)
+    python_tools.FOLDER.parent.mkdir(exist_ok=True)
+    new.rename(python_tools.FOLDER)
+    return count_packages(python_tools.FOLDER)
+
+
+def ros_release(release: str) -> str:
+    folder = ros.folder(release)
+    clear = partial(run, "python3", "-m", "venv", "--clear", "--without-pip", folder)
+    clear()
+    locked_packages(ros.lock(release), DOWNLOADS / f"ros-{release}", clear, of=("--python", folder))
+    run(ros.python(release), "-c", "import rclpy")
+    return count_packages(ros.packages(release))
+
+
+def locked_packages(lock: Path, wheels: Path, clear, of=(), target=()) -> None:
+    """All of a lock, from wheels of an earlier download if these are complete; `clear` makes room for a second try."""
+    pip = ["python3", "-m", "pip", *of, "--quiet", "--disable-pip-version-check", "--no-cache-dir"]
+    options = ["--only-binary=:all:", "--require-hashes", "--requirement", lock, "--no-deps"]
+    install = [*pip, "install", *options, "--no-index", "--find-links", wheels, *target]
     # The packages of other Pythons that may be configured are no business of these.
     environment = {**os.environ, "PIP_ROOT_USER_ACTION": "ignore", "PYTHONPATH": ""}
-    shutil.rmtree(new, ignore_errors=True)
     wheels.mkdir(exist_ok=True)
     try:
         run(*install, env=environment)
     except Failure:
-        shutil.rmtree(new, ignore_errors=True)
-        run(*pip, "download", *options, "--no-deps", "--dest", wheels, env=environment)
+        clear()
+        run(*pip, "download", *options, "--dest", wheels, env=environment)
         run(*install, env=environment)
-    shutil.rmtree(python_tools.FOLDER, ignore_errors=True)
-    python_tools.FOLDER.parent.mkdir(exist_ok=True)
-    new.rename(python_tools.FOLDER)
-    return f"{len(list(python_tools.FOLDER.glob('*.dist-info')))} packages"
+
+
+def count_packages(folder: Path) -> str:
+    return f"{len(list(folder.glob('*.dist-info')))} packages"
 
 
 def node() -> None:
@@ -366,4 +387,8 @@ COMPONENTS = {
     "npm": Component(npm, files=(node_tools.MODULES,), after=("node",),
                      locks=(node_tools.PACKAGES / "package-lock.json",)),
     "kafka": Component(kafka, files=(HOME / "kafka" / "libs", HOME / "kafka" / "formatted"), after=("jre",)),
+}
+COMPONENTS |= {
+    f"ros-{release}": Component(partial(ros_release, release), files=(ros.packages(release),), locks=(ros.lock(release),))
+    for release in ros.RELEASES
 }

@@ -32,6 +32,8 @@ pub struct FlowSpec {
     pub kafka: Option<(String, String)>,
     /// DDS domain of the layer scope, on loopback or its host's address.
     pub layer_domain: Option<u16>,
+    /// `ROS_DOMAIN_ID` of the ROS 2 network, on loopback.
+    pub ros2: Option<u16>,
     /// DDS domain of the inter scope, on loopback or its host's address.
     pub domain: Option<u16>,
     /// The host of a network that it runs on; absent = this machine.
@@ -60,6 +62,7 @@ impl FlowSpec {
             redis: None,
             kafka: None,
             layer_domain: None,
+            ros2: None,
             domain: None,
             host: None,
             peers: Vec::new(),
@@ -88,6 +91,13 @@ impl FlowSpec {
     #[must_use]
     pub fn on_dds(mut self, domain: u16) -> Self {
         self.layer_domain = Some(domain);
+        self
+    }
+
+    /// With the ROS 2 network of its host.
+    #[must_use]
+    pub fn on_ros2(mut self, domain: u16) -> Self {
+        self.ros2 = Some(domain);
         self
     }
 
@@ -130,6 +140,9 @@ impl FlowSpec {
                 text,
                 "  layer: {{ dds: {{ domain: {domain}, interface: \"{listen}\" }} }}"
             );
+        }
+        if let Some(domain) = self.ros2 {
+            let _ = writeln!(text, "  plugins: [{{ ros2: {{ domain: {domain} }} }}]");
         }
         if let Some(domain) = self.domain {
             let peers = match (&self.host, &self.peers[..]) {

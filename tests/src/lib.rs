@@ -4,6 +4,7 @@
 use std::time::Duration;
 
 pub mod admin;
+mod dialogue;
 pub mod fleet;
 pub mod flow;
 mod guard;
@@ -14,6 +15,7 @@ pub mod network;
 pub mod plain;
 pub mod process;
 pub mod proxy;
+pub mod ros2;
 pub mod scenario;
 pub mod servers;
 pub mod stream;

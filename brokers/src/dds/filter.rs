@@ -25,7 +25,7 @@ mod tests;
 use std::io;
 
 pub(super) use program::Samples;
-pub(super) use socket::{Attached, attach};
+pub(super) use socket::{Attached, attach, keep_announcements, steer};
 
 /// Why datagrams are not filtered.
 #[derive(Debug, thiserror::Error)]

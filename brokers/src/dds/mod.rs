@@ -6,6 +6,7 @@
 //!             ── Reader (a thread of its own) ──► sink(participant, octets)
 //!             ── EndpointWatch (a thread of its own) ──► sink(all remote readers and writers)
 //! Relay       ── repeats the participant's announcement to hosts that multicast does not reach
+//! Metatraffic ── between RustDDS and the discovery of other implementations
 //! ```
 //!
 //! Nothing here blocks a caller on the network, and a panic inside RustDDS never leaves this
@@ -18,11 +19,13 @@ mod farewell;
 mod fault;
 mod filter;
 pub mod layer;
+mod metatraffic;
 mod nudge;
 pub(crate) mod participant;
 mod pulse;
 mod reader;
 mod relay;
+mod rtps;
 mod sample;
 mod watch;
 mod writer;
@@ -42,8 +45,8 @@ pub use reader::{OctetsSink, Reader, Sample, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
 pub use sample::{Cdr, octet_sequence};
 pub use watch::{EndpointWatch, Endpoints, FoundEndpoint};
-pub(crate) use writer::participant_of;
 pub use writer::{EndpointId, Writer, Written};
+pub(crate) use writer::{endpoint_of, participant_of};
 
 /// The type of all samples, IDL `sequence<octet>`.
 pub const FRAME_TYPE: &str = "blaze::v1::Frame";

@@ -15,6 +15,7 @@ use rustdds::{
 };
 
 use super::filter::{self, Attached, FilterError, Samples};
+use super::metatraffic::{Metatraffic, Sockets};
 use super::pulse::port_is_free;
 use super::reader::{OctetsSink, Reader, SampleSink, of_octets};
 use super::sample::{Cdr, CdrAdapter};
@@ -84,6 +85,7 @@ impl ParticipantConfig {
             largest: self.largest_sample,
             repaired: self.repairs_fragments,
             any_vendor: self.any_vendor,
+            repeated: false,
         }
     }
 
@@ -147,8 +149,10 @@ pub struct Terms {
     pub marked: bool,
     /// A writer offers a sample at least this often; a reader asks for that.
     pub deadline: Option<time::Duration>,
-    /// A writer tells this often that it lives, by itself; a reader asks for that.
+    /// A writer tells this often that it lives; a reader asks for that.
     pub lease: Option<time::Duration>,
+    /// It tells so by writing (MANUAL_BY_TOPIC), else by itself.
+    pub manual: bool,
 }
 
 impl Profile {
@@ -174,8 +178,10 @@ impl Profile {
         if let Some(deadline) = self.terms.deadline {
             builder = builder.deadline(Deadline(duration(deadline)));
         }
-        if let Some(lease) = self.terms.lease {
-            let lease_duration = duration(lease);
+        let lease_duration = self.terms.lease.map_or(Duration::INFINITE, duration);
+        if self.terms.manual {
+            builder = builder.liveliness(Liveliness::ManualByTopic { lease_duration });
+        } else if self.terms.lease.is_some() {
             builder = builder.liveliness(Liveliness::Automatic { lease_duration });
         }
         if self.terms.marked {
@@ -203,6 +209,8 @@ pub struct Participant {
     port: u16,
     filter: Result<Attached, FilterError>,
     failed: Arc<AtomicBool>,
+    /// Carries the good-bye of RustDDS, so it drops last.
+    metatraffic: Option<Metatraffic>,
 }
 
 impl fmt::Debug for Participant {
@@ -237,20 +245,17 @@ impl Participant {
                 "too many DDS participants on this host: others here do not see this one"
             );
         }
+        let (prefix, failed) = (prefix_of(dds.guid()), Arc::default());
         let port = announcement_port(config.domain, id);
         let multicast = multicast_port(config.domain);
-        let filter = filter::attach(&[port, port + 1, multicast, multicast + 1], config.samples());
+        let sockets = config.any_vendor.then(|| Sockets::open(config.domain, config.address, port));
+        let sockets = sockets.and_then(|opened| opened.inspect_err(warn_of_ghosts).ok());
+        let samples = Samples { repeated: sockets.is_some(), ..config.samples() };
+        let filter = filter::attach(&[port, port + 1, multicast, multicast + 1], samples);
         warn_once(&filter);
-        Ok(Self {
-            prefix: prefix_of(dds.guid()),
-            port,
-            filter,
-            dds,
-            publisher,
-            subscriber,
-            config,
-            failed: Arc::default(),
-        })
+        let start = |sockets| Metatraffic::start(sockets, prefix, Arc::clone(&failed));
+        let metatraffic = sockets.map(start).transpose()?;
+        Ok(Self { prefix, port, filter, dds, publisher, subscriber, config, failed, metatraffic })
     }
 
     /// Its identity on the wire.
@@ -277,10 +282,11 @@ impl Participant {
     }
 
     /// Datagrams that the kernel dropped at its sockets: hostile ones, and those for which no room
-    /// was left.
+    /// was left. With them what is malformed of discovery that goes through this process.
     #[must_use]
     pub fn dropped_by_kernel(&self) -> u64 {
         self.filter.as_ref().map_or(0, Attached::dropped)
+            + self.metatraffic.as_ref().map_or(0, Metatraffic::dropped)
     }
 
     /// Makes a writer of a topic of [`FRAME_TYPE`].
@@ -353,7 +359,8 @@ impl Participant {
         }
         let commands = catch_unwind(AssertUnwindSafe(|| self.dds.assert_liveliness().is_ok()))
             .unwrap_or(false);
-        !port_is_free(self.port) && commands
+        // That of announcements is held by others beside RustDDS.
+        !port_is_free(self.port + 1) && commands
     }
 
     /// Ends or blocks the event loop of RustDDS, which then panics or hangs, for tests of those who
@@ -423,6 +430,10 @@ fn weakness(filter: &Result<Attached, FilterError>) -> Option<String> {
             Some(format!("no packet filter, so any sender can exhaust the memory: {error}"))
         }
     }
+}
+
+fn warn_of_ghosts(error: &FilterError) {
+    tracing::warn!(%error, "Fast DDS will not see what is gone here");
 }
 
 fn warn_once(filter: &Result<Attached, FilterError>) {

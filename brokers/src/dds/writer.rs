@@ -2,7 +2,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use rustdds::dds::WriteError;
@@ -14,7 +14,7 @@ use super::sample::{Cdr, CdrAdapter, octet_sequence};
 /// Identity of a reader or writer on the wire: its participant's and four bytes.
 pub type EndpointId = [u8; 16];
 
-pub(super) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
+pub(crate) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
     guid.to_bytes()
 }
 
@@ -49,7 +49,8 @@ const STATUS_EVENTS: usize = 4;
 /// Writes one topic. Never waits.
 pub struct Writer {
     writer: no_key::DataWriter<Cdr, CdrAdapter>,
-    matched: AtomicBool,
+    /// How many readers it has met.
+    matched: AtomicUsize,
     /// Late joiners get what was written before they came, so it is written without a reader, too.
     keeps: bool,
     failed: Arc<AtomicBool>,
@@ -62,7 +63,7 @@ impl Writer {
         keeps: bool,
         failed: Arc<AtomicBool>,
     ) -> Self {
-        Self { writer, matched: AtomicBool::new(false), keeps, failed }
+        Self { writer, matched: AtomicUsize::new(0), keeps, failed }
     }
 
     /// Hands octets to RustDDS, as a sample of [`FRAME_TYPE`](super::FRAME_TYPE). Returns whether
@@ -77,7 +78,7 @@ impl Writer {
     /// way. `options` travel with the sample.
     pub fn write_cdr(&self, cdr: Cdr, options: WriteOptionsBuilder) -> Written {
         self.contain(|| {
-            if !(self.is_matched_now() || self.keeps) {
+            if !(self.matched_now() > 0 || self.keeps) {
                 return Some(Written::NoReader);
             }
             // Best effort gives up a sample of which the socket cannot take the rest at once.
@@ -108,21 +109,27 @@ impl Writer {
     /// has gone.
     #[must_use]
     pub fn is_matched(&self) -> bool {
-        self.contain(|| self.is_matched_now().then_some(())).is_some()
+        self.contain(|| (self.matched_now() > 0).then_some(())).is_some()
     }
 
-    fn is_matched_now(&self) -> bool {
+    /// Whether so many readers are there, as far as RustDDS tells.
+    pub(super) fn has_met(&self, readers: usize) -> bool {
+        self.contain(|| Some(self.matched_now() >= readers.min(STATUS_EVENTS))).unwrap_or(false)
+    }
+
+    fn matched_now(&self) -> usize {
         let mut events = 0;
         while let Some(status) = self.writer.try_recv_status() {
             events += 1;
             if let DataWriterStatus::PublicationMatched { current, .. } = status {
-                self.matched.store(current.count() > 0, Ordering::Relaxed);
+                let count = usize::try_from(current.count()).unwrap_or(0);
+                self.matched.store(count, Ordering::Relaxed);
             }
         }
         if events >= STATUS_EVENTS {
             // Others may have been lost. A sample without a reader costs nothing, a reader without
             // its samples does.
-            self.matched.store(true, Ordering::Relaxed);
+            self.matched.fetch_max(STATUS_EVENTS, Ordering::Relaxed);
         }
         self.matched.load(Ordering::Relaxed)
     }

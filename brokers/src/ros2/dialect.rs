@@ -12,7 +12,7 @@ use rustdds::{Timestamp, WriteOptionsBuilder};
 use super::Inner;
 use super::endpoint::RosEndpoint;
 use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
-use super::names::{Carries, type_of_dds};
+use super::names::Carries;
 use super::network::Knowledge;
 use super::services::{Forwarded, OnWire, Services, carries};
 use crate::dds::adapter::{
@@ -21,7 +21,7 @@ use crate::dds::adapter::{
 use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
-    Relay, Sample, Terms, Writer, Written,
+    Relay, Sample, Terms, Writer, Written, endpoint_of,
 };
 use crate::outbox::Body;
 use crate::port::Content;
@@ -67,6 +67,7 @@ impl Dialect for Ros {
         _: Instant,
     ) -> Result<Box<dyn Companion>, DdsError> {
         self.relay.set_participant(participant.prefix());
+        self.knowledge.set_own(participant.prefix());
         let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,
@@ -81,19 +82,19 @@ impl Dialect for Ros {
             gid: self.gid,
             node: self.flow.ros2_node(),
             knowledge: Arc::clone(&self.knowledge),
+            user: Arc::clone(&self.user),
             told: None,
         }))
     }
 
-    fn mixes_durability(&self) -> bool {
-        true
-    }
-
     fn note_endpoints(&self, endpoints: &Endpoints) {
-        self.knowledge.note_endpoints(Instant::now(), endpoints);
+        let changed = self.knowledge.note_endpoints(Instant::now(), endpoints);
+        if changed.is_empty() {
+            return;
+        }
         self.knowledge.forget_requests(&mut self.services.lock());
         if let Some(user) = self.user.get().and_then(Weak::upgrade) {
-            user.follow();
+            user.follow(&changed);
         }
     }
 
@@ -143,13 +144,8 @@ impl Dialect for Ros {
         frame.map(Content::Frame).map_err(|_| NoMessage::Malformed)
     }
 
-    fn encode(&self, topic: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
+    fn encode(&self, _: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
         let Body::Frame(frame) = message else { return Err(DropReason::BrokerError) };
-        if let Some((_, told)) = frame.encoding().split_once("type=")
-            && type_of_dds(&topic.type_name).as_deref() != Some(told.trim())
-        {
-            return Err(DropReason::BrokerError);
-        }
         let cdr = Cdr::little(frame.payload().clone()).ok_or(DropReason::BrokerError)?;
         let mut options = WriteOptionsBuilder::new();
         if let Some(written) = timestamp(frame.publish_time_ns()) {
@@ -259,6 +255,7 @@ struct Graph {
     /// Full name of the own node.
     node: String,
     knowledge: Arc<Knowledge>,
+    user: Arc<OnceLock<Weak<Inner>>>,
     told: Option<ParticipantNodes>,
 }
 
@@ -272,13 +269,16 @@ impl Companion for Graph {
             let from = prefix_of(sample.writer_guid);
             match ParticipantNodes::read(&sample.sample) {
                 Some(told) if from != own && told.participant[..12] == from.0 => {
-                    self.knowledge.note_nodes(now, from, &told);
+                    self.knowledge.note_nodes(now, from, told.owners(from));
                 }
                 Some(_) => {}
                 None => others.note_malformed(),
             }
         }
-        self.knowledge.tick(now, own);
+        self.knowledge.tick(now);
+        if let Some(user) = self.user.get().and_then(Weak::upgrade) {
+            user.tick(now);
+        }
         false
     }
 }
@@ -286,7 +286,10 @@ impl Companion for Graph {
 impl Graph {
     /// Tells the own endpoints, if they are others than before.
     fn tell(&mut self, own: GuidPrefix, others: &Others<'_>) {
-        let (readers, writers) = others.own_endpoints();
+        let (mut readers, mut writers) = others.own_endpoints();
+        // Other flows know it by these, also when it has nothing else there.
+        readers.push(endpoint_of(self.reader.guid()));
+        writers.push(self.writer.id());
         let Some((namespace, name)) = self.node.rsplit_once('/') else { return };
         let (namespace, name) = (namespace.to_owned(), name.to_owned());
         let node = Node { namespace, name, readers, writers };

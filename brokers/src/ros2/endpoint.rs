@@ -3,6 +3,8 @@
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
+use rustdds::policy::Liveliness;
+
 use super::names::{RosName, type_of_dds};
 use crate::dds::{EndpointId, FoundEndpoint};
 
@@ -77,6 +79,8 @@ pub struct RosEndpoint {
     pub deadline: Option<Duration>,
     /// Lease of its liveliness, offered or asked for; `None`: none.
     pub lease: Option<Duration>,
+    /// A writer tells that it lives by writing; a reader asks for that.
+    pub manual: bool,
     /// After this time samples are over; `None`: never.
     pub lifespan: Option<Duration>,
     /// IPv4 addresses at which it is reached; empty where it uses no UDP.
@@ -115,6 +119,10 @@ impl RosEndpoint {
             durable: found.is_durable(),
             deadline: found.qos.deadline().and_then(|deadline| finite(deadline.0)),
             lease: found.qos.liveliness().and_then(|liveliness| finite(liveliness.duration())),
+            manual: matches!(
+                found.qos.liveliness(),
+                Some(Liveliness::ManualByParticipant { .. } | Liveliness::ManualByTopic { .. })
+            ),
             lifespan: found.qos.lifespan().and_then(|lifespan| finite(lifespan.duration)),
             addresses,
             is_keyed: matches!(found.id[15], 0x02 | 0x07),
@@ -123,6 +131,12 @@ impl RosEndpoint {
 }
 
 impl RosEndpoint {
+    /// Whether its samples are messages of ROS 2: they have a type of ROS 2 and no keys.
+    #[must_use]
+    pub fn is_readable(&self) -> bool {
+        self.type_name.is_some() && !self.is_keyed
+    }
+
     /// Its lifespan in whole milliseconds, at least 1; 0 = none.
     #[must_use]
     pub fn lifespan_ms(&self) -> u32 {
@@ -144,7 +158,7 @@ fn type_hash(user_data: &[u8]) -> Option<String> {
 #[cfg(test)]
 pub(super) mod tests {
     use rustdds::QosPolicies;
-    use rustdds::policy::{Deadline, Durability, Lifespan, Liveliness};
+    use rustdds::policy::{Deadline, Durability, Lifespan};
 
     use super::*;
 
@@ -184,6 +198,7 @@ pub(super) mod tests {
         assert!(endpoint.reliable && endpoint.durable && !endpoint.is_keyed);
         assert_eq!(endpoint.deadline, Some(Duration::from_secs(2)));
         assert_eq!(endpoint.lease, Some(Duration::from_secs(3)));
+        assert!(endpoint.manual);
         assert_eq!(endpoint.lifespan, None);
         assert_eq!(endpoint.addresses, [Ipv4Addr::LOCALHOST]);
     }

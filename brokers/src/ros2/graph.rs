@@ -6,9 +6,11 @@
 //! which the last eight are 0.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
-use crate::dds::{Cdr, EndpointId};
 use bytes::{BufMut, BytesMut};
+
+use crate::dds::{Cdr, EndpointId, GuidPrefix, participant_of};
 
 /// The DDS topic, and its type.
 pub(super) const GRAPH_TOPIC: (&str, &str) =
@@ -39,6 +41,8 @@ impl GidLength {
 const MAX_NODES: usize = 1024;
 const MAX_ENDPOINTS: usize = 10_000;
 const MAX_NAME: usize = 256;
+/// Bytes of a sample: what a participant with 10,000 endpoints tells.
+const MAX_BYTES: usize = 256 * 1024;
 
 /// One node.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -68,7 +72,7 @@ impl ParticipantNodes {
     /// Reads a sample; gids have the one length or the other. `None` where it is no such message, or
     /// beyond the limits.
     pub(super) fn read(cdr: &Cdr) -> Option<Self> {
-        let is_big = cdr.is_big_endian()?;
+        let is_big = cdr.is_big_endian().filter(|_| cdr.body().len() <= MAX_BYTES)?;
         let read = |gid| Input { bytes: cdr.body(), at: 0, is_big, gid }.participant();
         read(GidLength::Short).or_else(|| read(GidLength::Long))
     }
@@ -89,15 +93,19 @@ impl ParticipantNodes {
         Cdr::little(out.bytes.freeze())
     }
 
-    /// The full name of the node that each reader and writer belongs to.
-    pub(super) fn owners(&self) -> HashMap<EndpointId, String> {
-        let of_node = |node: &Node| {
-            let name = node.full_name();
-            let endpoints: Vec<EndpointId> =
-                node.readers.iter().chain(&node.writers).copied().collect();
-            endpoints.into_iter().map(move |endpoint| (endpoint, name.clone()))
-        };
-        self.nodes.iter().flat_map(of_node).collect()
+    /// The full name of the node of each reader and writer that its participant can have.
+    pub(super) fn owners(&self, from: GuidPrefix) -> HashMap<EndpointId, Arc<str>> {
+        let mut owners = HashMap::new();
+        for node in &self.nodes {
+            let name: Arc<str> = node.full_name().into();
+            let own = |id: &&EndpointId| participant_of(id) == from;
+            for id in node.readers.iter().chain(&node.writers).filter(own) {
+                if owners.len() < MAX_ENDPOINTS {
+                    owners.insert(*id, Arc::clone(&name));
+                }
+            }
+        }
+        owners
     }
 }
 
@@ -213,9 +221,13 @@ mod tests {
             let sample = nodes().write(gid).unwrap();
             assert_eq!(ParticipantNodes::read(&sample), Some(nodes()), "{gid:?}");
         }
-        let owners = nodes().owners();
-        assert_eq!(owners[&[11; 16]], "/talker");
-        assert_eq!(owners[&[22; 16]], "/arm/a");
+        let mut all = HashMap::new();
+        for number in [11, 22] {
+            let owners = nodes().owners(GuidPrefix([number; 12]));
+            assert_eq!(owners.len(), 1, "only what its participant can have");
+            all.extend(owners);
+        }
+        assert_eq!((&*all[&[11; 16]], &*all[&[22; 16]]), ("/talker", "/arm/a"));
         let none = ParticipantNodes { participant: [7; 16], nodes: Vec::new() };
         let sample = none.write(GidLength::Short).unwrap();
         let padded = little(&[sample.body(), &[0xff; 3]].concat());
@@ -235,6 +247,12 @@ mod tests {
         let mut long = nodes();
         long.nodes[0].name = "n".repeat(MAX_NAME);
         assert!(!is_read(&long));
+        let mut large = nodes();
+        large.nodes = vec![large.nodes[0].clone(); 5];
+        large.nodes[0].readers = vec![[1; 16]; MAX_ENDPOINTS];
+        assert!(is_read(&large));
+        large.nodes[1].readers = vec![[1; 16]; MAX_ENDPOINTS];
+        assert!(!is_read(&large));
     }
 
     proptest! {

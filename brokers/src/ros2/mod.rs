@@ -23,7 +23,7 @@ mod shown;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Arc, OnceLock, Weak};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use blaze_domain::names::ChannelName;
@@ -197,8 +197,8 @@ impl Broker for Ros2Broker {
         self.inner.adapter.status()
     }
 
-    /// Writes a topic. Messages say their type in `encoding`; others are dropped, and so are those
-    /// that are no little-endian CDR.
+    /// Writes a topic. Messages say their type in `encoding`; others are dropped, and so are those in
+    /// big-endian CDR or XCDR2. Drops count as `broker_error`.
     fn publisher(
         &self,
         channel: &ChannelName,
@@ -242,23 +242,19 @@ impl Broker for Ros2Broker {
 }
 
 impl Inner {
-    /// Readers and writers follow the endpoints of others.
-    fn follow(&self) {
-        let offers: Vec<Arc<Offer>> =
-            self.offers.lock().values().flatten().filter_map(Weak::upgrade).collect();
-        offers.iter().for_each(|offer| offer.follow(self));
-        let shown = self.shown.lock().names();
-        shown.iter().for_each(|name| self.follow_shown(name));
-        self.reads.lock().retain_mut(|read| {
-            read.follow(self);
-            !read.sender.is_closed()
-        });
+    /// Readers and writers of these names follow the endpoints of others.
+    fn follow(&self, names: &BTreeSet<RosName>) {
+        for name in names {
+            self.offers_of(name).iter().for_each(|offer| offer.follow(self));
+            self.follow_shown(name);
+        }
+        let mut reads = self.reads.lock();
+        reads.iter_mut().filter(|read| names.contains(&read.name)).for_each(|it| it.follow(self));
     }
 
     /// What shows of a topic follows the writers that are used.
     fn follow_shown(&self, name: &RosName) {
-        let offers: Vec<Arc<Offer>> =
-            self.offers.lock().get(name).into_iter().flatten().filter_map(Weak::upgrade).collect();
+        let offers = self.offers_of(name);
         self.shown.lock().follow(self, name, offers.iter().map(Arc::as_ref));
     }
 
@@ -284,11 +280,16 @@ impl Inner {
         Ok((topic, name))
     }
 
+    /// The readers of a topic and type.
+    fn readers(&self, name: &RosName, type_name: &str) -> Vec<Arc<RosEndpoint>> {
+        let mut readers = self.knowledge.endpoints(name, false);
+        readers.retain(|reader| reader.type_name.as_deref() == Some(type_name));
+        readers
+    }
+
     /// What a writer is to offer, so that all readers of a topic and type are served.
-    fn offered(&self, name: &RosName, type_name: &str, published_reliable: bool) -> Offered {
-        let readers = self.knowledge.endpoints(name, false);
-        let of_type = readers.iter().filter(|it| it.type_name.as_deref() == Some(type_name));
-        Offered::to(published_reliable, of_type.map(Arc::as_ref))
+    fn offered(&self, name: &RosName, type_name: &str, published: PublisherOptions) -> Offered {
+        Offered::to(published, self.readers(name, type_name).iter().map(Arc::as_ref))
     }
 
     /// A DDS writer; `None` where ROS 2 can have no such type, or the broker is closed.
@@ -297,11 +298,12 @@ impl Inner {
         name: &RosName,
         topic: &TopicName,
         type_name: &str,
-        terms: Terms,
-        options: PublisherOptions,
+        offered: Offered,
+        large: bool,
     ) -> Option<TopicPublisher> {
-        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, terms);
-        self.adapter.publisher(topic, options).ok()
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, offered.terms);
+        let Offered { depth, reliable, .. } = offered;
+        self.adapter.publisher(topic, PublisherOptions { depth, reliable, large }).ok()
     }
 
     /// One that is there to be seen, until others write.
@@ -310,14 +312,25 @@ impl Inner {
         name: &RosName,
         topic: &TopicName,
         type_name: &str,
-        terms: Terms,
-        options: PublisherOptions,
+        offered: Offered,
     ) -> Option<TopicPublisher> {
-        if options.depth == 0 {
-            return self.writer(name, topic, type_name, terms, options);
+        if offered.depth == 0 {
+            return self.writer(name, topic, type_name, offered, false);
         }
-        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, terms);
-        Some(self.adapter.keeping(topic, options.depth))
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, offered.terms);
+        Some(self.adapter.keeping(topic, offered.depth))
+    }
+
+    /// What takes time has its turn.
+    fn tick(&self, now: Instant) {
+        let offers: Vec<Arc<Offer>> =
+            self.offers.lock().values().flatten().filter_map(Weak::upgrade).collect();
+        offers.iter().for_each(|offer| offer.tick(self, now));
+        self.reads.lock().retain(|read| !read.sender.is_closed());
+    }
+
+    fn offers_of(&self, name: &RosName) -> Vec<Arc<Offer>> {
+        self.offers.lock().get(name).into_iter().flatten().filter_map(Weak::upgrade).collect()
     }
 }
 
@@ -325,8 +338,7 @@ impl Read {
     /// Makes readers for types that writers have now.
     fn follow(&mut self, inner: &Inner) {
         for writer in inner.knowledge.endpoints(&self.name, true) {
-            let is_readable = writer.type_name.is_some() && !writer.is_keyed;
-            if !is_readable || self.types.contains(&writer.dds_type) {
+            if !writer.is_readable() || self.types.contains(&writer.dds_type) {
                 continue;
             }
             let terms = Terms { marked: true, ..Terms::default() };

@@ -2,6 +2,7 @@
 //! takes messages of.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -10,12 +11,9 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use super::endpoint::{RosEndpoint, Vendor};
-use super::graph::ParticipantNodes;
 use super::names::RosName;
 use super::services;
-
-use crate::dds::adapter::Admission;
-
+use crate::dds::adapter::{Admission, LONGEST_DOUBT};
 use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix, participant_of};
 
 /// Endpoints of others that are looked at; further ones are counted.
@@ -41,23 +39,31 @@ pub struct Network {
 }
 
 struct Entry {
+    /// As discovery found it last.
+    found: FoundEndpoint,
     endpoint: Arc<RosEndpoint>,
     since: Instant,
+    /// A writer that has left stays for as long as its samples may wait.
+    gone: Option<Instant>,
 }
 
 #[derive(Default)]
 struct State {
     own: Option<GuidPrefix>,
     endpoints: BTreeMap<EndpointId, Entry>,
-    /// The same by name: readers and writers.
+    /// Those that are there, by name: readers and writers.
     by_name: HashMap<RosName, [Vec<Arc<RosEndpoint>>; 2]>,
     refused: usize,
     /// Endpoints of flows.
     marked: HashSet<EndpointId>,
+    /// Participants with endpoints.
+    alive: HashSet<GuidPrefix>,
     /// By participant: the node of each endpoint.
-    nodes: HashMap<GuidPrefix, HashMap<EndpointId, String>>,
+    nodes: HashMap<GuidPrefix, HashMap<EndpointId, Arc<str>>>,
     /// Whether this flow takes messages of a writer, as far as that has been decided.
     owned: HashMap<EndpointId, bool>,
+    /// When one will count, or no longer, though nothing changes.
+    due: Option<Instant>,
 }
 
 /// What the threads of the adapter and the flow share of it.
@@ -75,69 +81,93 @@ impl Knowledge {
         self.network.subscribe()
     }
 
-    /// Takes over what discovery has found.
-    pub(super) fn note_endpoints(&self, now: Instant, found: &Endpoints) {
-        let mut state = self.state.lock();
-        let alive: HashSet<GuidPrefix> =
-            found.writers.iter().chain(&found.readers).map(FoundEndpoint::participant).collect();
-        state.nodes.retain(|participant, _| alive.contains(participant));
-        state.marked.clear();
-        state.refused = 0;
-        let mut known = std::mem::take(&mut state.endpoints);
-        for (all, is_writer) in [(&found.writers, true), (&found.readers, false)] {
-            for one in all {
-                if one.is_marked() {
-                    state.marked.insert(one.id);
-                } else if let Some(endpoint) = RosEndpoint::of(one, is_writer) {
-                    state.put(known.remove(&one.id), endpoint, now);
-                }
-            }
+    /// Takes over what discovery has found. Returns the names whose endpoints are others now.
+    pub(super) fn note_endpoints(&self, now: Instant, found: &Endpoints) -> BTreeSet<RosName> {
+        let state = &mut *self.state.lock();
+        let all = found.writers.iter().chain(&found.readers);
+        let before = std::mem::replace(
+            &mut state.alive,
+            all.clone().map(FoundEndpoint::participant).collect(),
+        );
+        // Those that were not found yet may have told their nodes before.
+        let alive = &state.alive;
+        state.nodes.retain(|from, _| alive.contains(from) || !before.contains(from));
+        let marked = all.filter(|one| one.is_marked()).map(|one| one.id).collect();
+        let marks_changed = std::mem::replace(&mut state.marked, marked) != state.marked;
+        let refused = std::mem::take(&mut state.refused);
+        let changed = state.take_over(now, found);
+        if marks_changed || refused != state.refused || !changed.is_empty() {
+            self.publish(state, now);
         }
-        let State { endpoints, by_name, owned, .. } = &mut *state;
-        owned.retain(|id, _| endpoints.contains_key(id));
-        by_name.clear();
-        for Entry { endpoint, .. } in endpoints.values() {
-            let of_name = by_name.entry(endpoint.name.clone()).or_default();
-            of_name[usize::from(endpoint.is_writer)].push(Arc::clone(endpoint));
-        }
-        self.publish(&state, now);
+        changed
     }
 
     /// Takes over which nodes a participant has.
-    pub(super) fn note_nodes(&self, now: Instant, from: GuidPrefix, told: &ParticipantNodes) {
-        let mut state = self.state.lock();
+    pub(super) fn note_nodes(
+        &self,
+        now: Instant,
+        from: GuidPrefix,
+        nodes: HashMap<EndpointId, Arc<str>>,
+    ) {
+        let state = &mut *self.state.lock();
         if state.nodes.len() >= MAX_PARTICIPANTS && !state.nodes.contains_key(&from) {
-            return;
-        }
-        let owners = told.owners();
-        let State { endpoints, nodes, .. } = &mut *state;
-        for (id, entry) in endpoints.iter_mut().filter(|(id, _)| id[..12] == from.0) {
-            let node = owners.get(id);
-            if entry.endpoint.node.as_ref() != node {
-                Arc::make_mut(&mut entry.endpoint).node = node.cloned();
+            let alive = &state.alive;
+            state.nodes.retain(|from, _| alive.contains(from));
+            if state.nodes.len() >= MAX_PARTICIPANTS {
+                return;
             }
         }
-        nodes.insert(from, owners);
-        self.publish(&state, now);
+        for (id, entry) in state.endpoints.range_mut(ids_of(from)) {
+            let node = nodes.get(id).map(|node| &**node);
+            if entry.endpoint.node.as_deref() != node {
+                Arc::make_mut(&mut entry.endpoint).node = node.map(ToOwned::to_owned);
+            }
+        }
+        if state.nodes.get(&from) != Some(&nodes) {
+            state.nodes.insert(from, nodes);
+            self.publish(state, now);
+        }
     }
 
-    /// Lets those count whose time has come. `own`: the own participant.
-    pub(super) fn tick(&self, now: Instant, own: GuidPrefix) {
-        let mut state = self.state.lock();
+    /// Takes over the own participant, before it has readers.
+    pub(super) fn set_own(&self, own: GuidPrefix) {
+        let state = &mut *self.state.lock();
         state.own = Some(own);
-        self.publish(&state, now);
+        self.publish(state, Instant::now());
+    }
+
+    /// Lets those count whose time has come.
+    pub(super) fn tick(&self, now: Instant) {
+        let state = &mut *self.state.lock();
+        if state.due.is_some_and(|due| due <= now) {
+            self.publish(state, now);
+        }
     }
 
     /// Which writers this flow takes messages of; those of others wait until they are named.
-    pub(super) fn set_owned(&self, owned: HashMap<EndpointId, bool>) {
-        self.state.lock().owned = owned;
+    pub(super) fn set_owned(&self, mut owned: HashMap<EndpointId, bool>) {
+        let state = &mut *self.state.lock();
+        // Those that have left are named once.
+        for (id, is_own) in std::mem::take(&mut state.owned) {
+            if state.endpoints.get(&id).is_some_and(|entry| entry.gone.is_some()) {
+                owned.entry(id).or_insert(is_own);
+            }
+        }
+        state.owned = owned;
+        if state.endpoints.values().any(|entry| entry.gone.is_some()) {
+            self.publish(state, Instant::now());
+        }
     }
 
     /// Whether a sample of a writer is to be taken.
     pub(super) fn admission(&self, writer: &EndpointId) -> Admission {
         let state = self.state.lock();
+        let is_own = state.own == Some(participant_of(writer));
+        // RustDDS gives what this flow writes to its readers, too.
         match state.owned.get(writer) {
-            _ if state.marked.contains(writer) => Admission::No,
+            _ if is_own || state.marked.contains(writer) || state.is_unreadable(writer) => {
+                Admission::No
+            }
             Some(true) => Admission::Yes,
             Some(false) => Admission::No,
             None => Admission::Later,
@@ -175,20 +205,33 @@ impl Knowledge {
         requests.retain(is_client, is_served);
     }
 
-    fn publish(&self, state: &State, now: Instant) {
-        let counts = |entry: &&Entry| {
-            entry.endpoint.node.is_some() || now.saturating_duration_since(entry.since) >= NODE_WAIT
+    fn publish(&self, state: &mut State, now: Instant) {
+        let mut due: Option<Instant> = None;
+        // Whether a time has come, which is looked at again then.
+        let mut is_over = |at: Instant| {
+            let is_over = at <= now;
+            if !is_over {
+                due = due.into_iter().chain([at]).min();
+            }
+            is_over
         };
-        let endpoints: Vec<Arc<RosEndpoint>> = state
-            .endpoints
-            .values()
-            .filter(counts)
-            .map(|entry| Arc::clone(&entry.endpoint))
-            .collect();
+        let mut endpoints = Vec::new();
+        for (id, Entry { endpoint, since, gone, .. }) in &state.endpoints {
+            let counts = endpoint.node.is_some() || is_over(*since + NODE_WAIT);
+            // One that was there for a moment only is named, too: its samples wait for that.
+            let stays = match gone {
+                Some(at) => !state.owned.contains_key(id) && !is_over(*at + LONGEST_DOUBT),
+                None => true,
+            };
+            if counts && stays {
+                endpoints.push(Arc::clone(endpoint));
+            }
+        }
+        state.due = due;
         let participants: HashSet<_> = endpoints.iter().map(|it| participant_of(&it.id)).collect();
         let participants = participants.len();
-        let of_flow = |id: &EndpointId| state.nodes.get(&participant_of(id))?.get(id).cloned();
-        let flows = state.marked.iter().filter_map(of_flow).collect();
+        let of_flow = |id: &EndpointId| state.nodes.get(&participant_of(id))?.get(id);
+        let flows = state.marked.iter().filter_map(of_flow).map(ToString::to_string).collect();
         let (own, refused) = (state.own, state.refused);
         let network = Network { own, endpoints, refused, participants, flows };
         self.network.send_if_modified(|known| {
@@ -201,29 +244,77 @@ impl Knowledge {
     }
 }
 
+/// All endpoints that a participant may have.
+fn ids_of(participant: GuidPrefix) -> RangeInclusive<EndpointId> {
+    let [mut first, mut last] = [[0; 16], [0xff; 16]];
+    first[..12].copy_from_slice(&participant.0);
+    last[..12].copy_from_slice(&participant.0);
+    first..=last
+}
+
 impl State {
-    /// Puts in what was found, with its node and when it was found first.
-    fn put(&mut self, known: Option<Entry>, mut endpoint: RosEndpoint, now: Instant) {
-        if self.endpoints.len() >= MAX_ENDPOINTS {
-            self.refused += 1;
-            return;
+    /// Takes over what was found: first what is known, so that a crowd displaces nobody. Returns
+    /// the names of what came, left or changed.
+    fn take_over(&mut self, now: Instant, found: &Endpoints) -> BTreeSet<RosName> {
+        let mut changed = BTreeSet::new();
+        let all: HashMap<EndpointId, (&FoundEndpoint, bool)> =
+            [(&found.writers, true), (&found.readers, false)]
+                .into_iter()
+                .flat_map(|(all, is_writer)| all.iter().map(move |one| (one.id, (one, is_writer))))
+                .filter(|(_, (one, _))| !one.is_marked())
+                .collect();
+        self.endpoints.retain(|id, entry| {
+            let is_there = all.contains_key(id);
+            if is_there != entry.gone.is_none() {
+                entry.gone = (!is_there).then_some(now);
+                changed.insert(entry.endpoint.name.clone());
+            }
+            let waits = |at: Instant| now.saturating_duration_since(at) < LONGEST_DOUBT;
+            entry.gone.is_none_or(|at| entry.endpoint.is_writer && waits(at))
+        });
+        let mut room = MAX_ENDPOINTS
+            .saturating_sub(self.endpoints.values().filter(|entry| entry.gone.is_none()).count());
+        for (id, (one, is_writer)) in all {
+            let known = self.endpoints.get(&id);
+            if known.is_some_and(|entry| entry.found == *one) {
+                continue;
+            }
+            let Some(mut endpoint) = RosEndpoint::of(one, is_writer) else { continue };
+            if known.is_none() && room == 0 {
+                self.refused += 1;
+                continue;
+            }
+            room -= usize::from(known.is_none());
+            let nodes = self.nodes.get(&participant_of(&id));
+            endpoint.node = nodes.and_then(|nodes| nodes.get(&id)).map(ToString::to_string);
+            changed.insert(endpoint.name.clone());
+            changed.extend(known.map(|entry| entry.endpoint.name.clone()));
+            let since = known.map_or(now, |entry| entry.since);
+            let (found, endpoint) = (one.clone(), Arc::new(endpoint));
+            self.endpoints.insert(id, Entry { found, endpoint, since, gone: None });
         }
-        let nodes = self.nodes.get(&participant_of(&endpoint.id));
-        endpoint.node = nodes.and_then(|nodes| nodes.get(&endpoint.id)).cloned();
-        let since = known.as_ref().map_or(now, |entry| entry.since);
-        // What has not changed stays the same, which is quick to compare.
-        let endpoint = match known {
-            Some(entry) if *entry.endpoint == endpoint => entry.endpoint,
-            _ => Arc::new(endpoint),
-        };
-        self.endpoints.insert(endpoint.id, Entry { endpoint, since });
+        let Self { endpoints, by_name, owned, .. } = self;
+        owned.retain(|id, _| endpoints.contains_key(id));
+        by_name.retain(|name, _| !changed.contains(name));
+        for Entry { endpoint, .. } in endpoints.values().filter(|entry| entry.gone.is_none()) {
+            if changed.contains(&endpoint.name) {
+                let of_name = by_name.entry(endpoint.name.clone()).or_default();
+                of_name[usize::from(endpoint.is_writer)].push(Arc::clone(endpoint));
+            }
+        }
+        changed
+    }
+
+    /// Whether a writer has no type of ROS 2, so that nobody decides about it.
+    fn is_unreadable(&self, writer: &EndpointId) -> bool {
+        self.endpoints.get(writer).is_some_and(|entry| !entry.endpoint.is_readable())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::endpoint::tests::found;
-    use super::super::graph::Node;
+    use super::super::graph::{Node, ParticipantNodes};
     use super::*;
 
     const TYPE: &str = "std_msgs::msg::dds_::String_";
@@ -251,12 +342,13 @@ mod tests {
             writers: vec![told.id],
         };
         let nodes = ParticipantNodes { participant: [0; 16], nodes: vec![node] };
-        knowledge.note_nodes(now, told.participant(), &nodes);
+        knowledge.note_nodes(now, told.participant(), nodes.owners(told.participant()));
         let a = ("/a".to_owned(), Some("/arm/talker".to_owned()));
         assert_eq!(names(&knowledge), std::slice::from_ref(&a));
-        knowledge.tick(now + NODE_WAIT, GuidPrefix([9; 12]));
+        knowledge.tick(now + NODE_WAIT);
         assert_eq!(names(&knowledge), [a, ("/b".to_owned(), None)]);
         // It was found before, so it need not wait again.
+        knowledge.set_owned([(told.id, true)].into());
         knowledge.note_endpoints(now + NODE_WAIT, &writers(vec![silent]));
         assert_eq!(names(&knowledge), [("/b".to_owned(), None)]);
     }
@@ -271,22 +363,116 @@ mod tests {
         let admissions = all.each_ref().map(|it| knowledge.admission(&it.id));
         assert_eq!(admissions, [Admission::Yes, Admission::No, Admission::Later]);
         assert_eq!(knowledge.admission(&[9; 16]), Admission::Later, "it may be found any moment");
+        knowledge.set_own(GuidPrefix([9; 12]));
+        assert_eq!(knowledge.admission(&[9; 16]), Admission::No, "its own");
         knowledge.note_endpoints(now, &writers(vec![all[2].clone()]));
+        assert_eq!(knowledge.admission(&all[0].id), Admission::Yes, "its samples may still come");
+        let later = now + LONGEST_DOUBT;
+        knowledge.note_endpoints(later, &writers(vec![all[2].clone()]));
         assert_eq!(knowledge.admission(&all[0].id), Admission::Later, "it is not known any more");
+    }
+
+    #[test]
+    fn a_writer_that_leaves_at_once_is_named_and_read() {
+        let now = Instant::now();
+        let knowledge = Knowledge::new();
+        let brief = found(1, "rt/a", TYPE);
+        knowledge.note_endpoints(now, &writers(vec![brief.clone()]));
+        knowledge.note_endpoints(now, &writers(Vec::new()));
+        assert!(knowledge.endpoints(&RosName::of_dds("rt/a").unwrap(), true).is_empty());
+        knowledge.tick(now + NODE_WAIT);
+        assert_eq!(names(&knowledge).len(), 1, "the flow is to decide");
+        assert_eq!(knowledge.admission(&brief.id), Admission::Later);
+        knowledge.set_owned([(brief.id, true)].into());
+        assert!(names(&knowledge).is_empty());
+        knowledge.set_owned(HashMap::new());
+        assert_eq!(knowledge.admission(&brief.id), Admission::Yes);
+        assert!(knowledge.writer(&brief.id).is_some());
+        knowledge.note_endpoints(now + LONGEST_DOUBT, &writers(Vec::new()));
+        assert!(knowledge.writer(&brief.id).is_none());
+    }
+
+    #[test]
+    fn one_that_is_never_named_goes_in_a_while() {
+        let now = Instant::now();
+        let knowledge = Knowledge::new();
+        knowledge.note_endpoints(now, &writers(vec![found(1, "rt/a", TYPE)]));
+        knowledge.note_endpoints(now, &writers(Vec::new()));
+        knowledge.tick(now + NODE_WAIT);
+        assert_eq!(names(&knowledge).len(), 1);
+        knowledge.tick(now + LONGEST_DOUBT);
+        assert!(names(&knowledge).is_empty());
+    }
+
+    #[test]
+    fn only_changes_are_told() {
+        let now = Instant::now();
+        let knowledge = Knowledge::new();
+        let name = |dds: &str| RosName::of_dds(dds).unwrap();
+        let (a, b) = (found(1, "rt/a", TYPE), found(2, "rt/b", TYPE));
+        let both = writers(vec![a.clone(), b.clone()]);
+        let changed = knowledge.note_endpoints(now, &both);
+        assert_eq!(changed, [name("rt/a"), name("rt/b")].into());
+        assert!(knowledge.note_endpoints(now, &both).is_empty());
+        knowledge.tick(now + NODE_WAIT);
+        let mut network = knowledge.subscribe();
+        network.mark_unchanged();
+        let before = knowledge.writer(&a.id).unwrap();
+        let other = FoundEndpoint { user_data: vec![1], ..b };
+        let found = writers(vec![a.clone(), other]);
+        assert_eq!(knowledge.note_endpoints(now, &found), [name("rt/b")].into());
+        assert!(Arc::ptr_eq(&before, &knowledge.writer(&a.id).unwrap()));
+        assert_eq!(knowledge.note_endpoints(now, &writers(vec![a])), [name("rt/b")].into());
+        assert_eq!(knowledge.endpoints(&name("rt/b"), true), []);
+    }
+
+    #[test]
+    fn nodes_may_be_told_before_their_endpoints_are_found() {
+        let now = Instant::now();
+        let knowledge = Knowledge::new();
+        let early = found(1, "rt/a", TYPE);
+        let nodes = HashMap::from([(early.id, Arc::from("/talker"))]);
+        knowledge.note_nodes(now, early.participant(), nodes);
+        knowledge.note_endpoints(now, &writers(Vec::new()));
+        knowledge.note_endpoints(now, &writers(vec![early.clone()]));
+        assert_eq!(names(&knowledge), [("/a".to_owned(), Some("/talker".to_owned()))]);
+        knowledge.note_endpoints(now, &writers(Vec::new()));
+        assert!(knowledge.state.lock().nodes.is_empty(), "its participant has left");
+        let crowd = (0..2 * MAX_PARTICIPANTS).map(|number| {
+            let mut prefix = [0; 12];
+            prefix[..8].copy_from_slice(&number.to_be_bytes());
+            GuidPrefix(prefix)
+        });
+        crowd.for_each(|from| knowledge.note_nodes(now, from, HashMap::new()));
+        assert!(knowledge.state.lock().nodes.len() <= MAX_PARTICIPANTS);
+    }
+
+    #[test]
+    fn nobody_waits_for_a_writer_that_cannot_be_read() {
+        let knowledge = Knowledge::new();
+        let mut keyed = found(1, "rt/a", TYPE);
+        keyed.id[15] = 0x02;
+        let other = found(2, "rt/a", "blaze::v1::Frame");
+        knowledge.note_endpoints(Instant::now(), &writers(vec![keyed.clone(), other.clone()]));
+        assert_eq!(knowledge.admission(&keyed.id), Admission::No);
+        assert_eq!(knowledge.admission(&other.id), Admission::No);
     }
 
     #[test]
     fn a_crowd_is_bounded_and_counted() {
         let now = Instant::now();
         let knowledge = Knowledge::new();
-        let crowd = (0..MAX_ENDPOINTS + 7).map(|number| {
+        let first = found(2, "rt/first", TYPE);
+        knowledge.note_endpoints(now, &writers(vec![first.clone()]));
+        let crowd = (0..MAX_ENDPOINTS + 6).map(|number| {
             let mut one = found(1, "rt/a", TYPE);
             one.id[4..12].copy_from_slice(&(number as u64).to_be_bytes());
             one
         });
-        knowledge.note_endpoints(now, &writers(crowd.collect()));
-        knowledge.tick(now + NODE_WAIT, GuidPrefix([9; 12]));
+        knowledge.note_endpoints(now, &writers(crowd.chain([first.clone()]).collect()));
+        knowledge.tick(now + NODE_WAIT);
         let network = Arc::clone(&knowledge.subscribe().borrow());
         assert_eq!((network.endpoints.len(), network.refused), (MAX_ENDPOINTS, 7));
+        assert!(knowledge.writer(&first.id).is_some(), "it was there first");
     }
 }

@@ -54,11 +54,6 @@ impl AllShown {
         true
     }
 
-    /// Names of all of them.
-    pub(super) fn names(&self) -> Vec<RosName> {
-        self.by_name.keys().cloned().collect()
-    }
-
     /// Makes the idle writer of a topic, or one that offers what readers ask for now; ends the one
     /// that is not needed beside those of `offers`.
     pub(super) fn follow<'a>(
@@ -72,16 +67,16 @@ impl AllShown {
             *writer = None;
             return;
         }
-        let offered = inner.offered(name, &shown.type_name, shown.reliable);
+        let published = PublisherOptions {
+            reliable: shown.reliable,
+            depth: shown.durable.into(),
+            ..PublisherOptions::default()
+        };
+        let offered = inner.offered(name, &shown.type_name, published);
         if writer.as_ref().is_some_and(|(before, _)| *before == offered) {
             return;
         }
-        let options = PublisherOptions {
-            reliable: offered.reliable,
-            depth: u32::from(shown.durable),
-            ..PublisherOptions::default()
-        };
-        let made = inner.idle_writer(name, topic, &shown.type_name, offered.terms, options);
+        let made = inner.idle_writer(name, topic, &shown.type_name, offered);
         *writer = made.map(|made| (offered, made));
     }
 }

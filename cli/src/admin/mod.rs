@@ -2,6 +2,7 @@
 
 mod bridges;
 mod peers;
+mod ros2;
 mod top;
 mod topics;
 mod why;
@@ -41,6 +42,14 @@ pub async fn bridges(flow: &FlowAddress, format: Format) -> Result<Exit, CliErro
 /// As [`topics`].
 pub async fn peers(flow: &FlowAddress, format: Format) -> Result<Exit, CliError> {
     show(flow, "/v1/peers", format, peers::table).await
+}
+
+/// `blaze ros2`.
+///
+/// # Errors
+/// As [`topics`].
+pub async fn ros2(flow: &FlowAddress, format: Format) -> Result<Exit, CliError> {
+    show(flow, "/v1/ros2", format, ros2::table).await
 }
 
 /// `blaze top`.

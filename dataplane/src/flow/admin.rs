@@ -3,7 +3,7 @@
 
 mod allocation;
 mod peers;
-mod ros2;
+pub(super) mod ros2;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -39,6 +39,7 @@ pub(super) fn router(shared: Arc<Shared>) -> Router {
         .route("/v1/peers", get(peers::peers))
         .route("/v1/allocation", get(allocation::allocation))
         .route("/v1/ros2", get(ros2::ros2))
+        .route("/v1/ros2/types", get(ros2::types))
         .route("/v1/why", get(super::why::why))
         .with_state(shared)
 }

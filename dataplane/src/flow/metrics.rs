@@ -9,6 +9,7 @@ use std::time::Instant;
 use blaze_domain::{Priority, Scope};
 use prometheus::{CounterVec, GaugeVec, Opts, Registry, TextEncoder};
 
+use super::admin::ros2::rows;
 use super::inter::InterScope;
 use super::routes::SourceState;
 use super::{Shared, class_label};
@@ -53,6 +54,8 @@ counter blaze_flow_convert_seconds topic Time that conversions took.
 counter blaze_flow_wire_bytes_total to,class IP bytes sent on the inter scope.
 gauge blaze_flow_peer_up peer 1 while the peer says Hello and acknowledges.
 gauge blaze_flow_peer_rtt_seconds peer Round trip to the peer.
+gauge blaze_ros2_endpoints kind,state Endpoints of the ROS 2 network.
+gauge blaze_ros2_participants - Participants of the ROS 2 network that have endpoints.
 gauge blaze_flow_leases kind Leases of local services.
 counter blaze_flow_link_events_total event Things that happened on the link.
 gauge blaze_flow_load_bytes_per_second direction Payload that the flow carries over the inter scope, \
@@ -126,6 +129,7 @@ impl Page {
         self.fill_link(shared);
         self.fill_compression(shared);
         self.fill_control(shared);
+        self.fill_ros2(shared);
         let text = TextEncoder::new().encode_to_string(&self.registry.gather())?;
         Ok(text + &latencies)
     }
@@ -349,6 +353,15 @@ impl Page {
         }
         self.add("blaze_flow_compression_pool_seconds", &[], pool.busy.as_secs_f64());
         self.count(&[("compression_refused", stage.refused), ("compression_failed", stage.failed)]);
+    }
+
+    fn fill_ros2(&self, shared: &Shared) {
+        let Some(ros2) = &shared.ros2 else { return };
+        for row in rows(&ros2.seen(), &shared.control.lock()) {
+            self.add("blaze_ros2_endpoints", &[row.kind, row.state], 1.0);
+        }
+        let participants = ros2.broker.network().borrow().participants;
+        self.add("blaze_ros2_participants", &[], participants as f64);
     }
 
     fn fill_control(&self, shared: &Shared) {

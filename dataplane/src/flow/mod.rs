@@ -441,8 +441,8 @@ fn types_of(ros2: Option<&Ros2Plugin>) -> Types {
     })
 }
 
-/// Starts the threads that compress and convert. They end when the flow has drained, or with the process if it
-/// does not.
+/// Starts the threads that compress and convert. They end when the flow has drained, or with the
+/// process if it does not.
 fn start_pool(plane: &Arc<Plane>, threads: u16, supervisor: &Supervisor) -> anyhow::Result<()> {
     let of_threads = supervisor.clone();
     let spawner: Spawner = Box::new(move |name, run| {

@@ -311,3 +311,40 @@ pub(super) async fn follow_network(shared: Arc<Shared>, stop: CancellationToken)
         tokio::time::sleep(BURST).await;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use blaze_domain::node_file::NodeFile;
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    /// Which of these DDS topics pass.
+    fn passing(rules: &Value, topics: &[&'static str]) -> Vec<&'static str> {
+        let tree = json!({"brokers": {"plugins": [{"ros2": rules}]}});
+        let rules = NodeFile::read(&tree).unwrap().0.brokers.ros2.unwrap().live;
+        let passes = |dds: &&&str| may_pass(&rules, &RosName::of_dds(dds).unwrap());
+        topics.iter().filter(passes).copied().collect()
+    }
+
+    #[test]
+    fn the_node_file_says_what_passes() {
+        let all = [
+            "rt/scan",
+            "rt/fib/_action/status",
+            "rq/fib/_action/send_goalRequest",
+            "rq/addRequest",
+            "rt/rosout",
+            "rr/talker/get_parametersReply",
+        ];
+        assert_eq!(passing(&json!({}), &all), all[..4]);
+        assert_eq!(passing(&json!({"system": true}), &all), all);
+        assert_eq!(
+            passing(&json!({"allow": ["fib"]}), &all),
+            all[1..3],
+            "an action with its parts"
+        );
+        assert_eq!(passing(&json!({"deny": ["fib", "add"]}), &all), all[..1]);
+        assert_eq!(passing(&json!({"allow": ["scan"], "deny": ["**"]}), &all), [""; 0]);
+    }
+}

@@ -31,7 +31,7 @@ pub use convert::{CompiledType, Conversion, ConvertFailure, Converted, Encoding}
 const RETRY: Duration = Duration::from_secs(5);
 
 /// Name and hash of a type, as a publisher or requester gives them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct MessageType<T = String> {
     /// `sensor_msgs/msg/Imu`
     pub name: T,

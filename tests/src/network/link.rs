@@ -1,34 +1,21 @@
 //! A running `blaze-wan`, and telling it what to do.
 
-use std::io::{BufRead as _, BufReader, Write as _};
-use std::process::{Child, ChildStdin, Stdio};
-use std::sync::mpsc::{Receiver, sync_channel};
 use std::time::Duration;
 
-use anyhow::Context as _;
-use parking_lot::Mutex;
 use serde_json::Value;
 
 use super::WanLink;
+use crate::dialogue::Dialogue;
 use crate::process::binary;
 use crate::wan::{Change, Command, LinkStats, Ways};
 
 /// An answer takes microseconds; the rest is for a machine that does much else.
 const ANSWER: Duration = Duration::from_secs(10);
-/// Lines that wait to be read: there is one answer for each command.
-const LINES: usize = 16;
-
 /// The process of one link; it ends when dropped.
 pub(super) struct LinkProcess {
     a: String,
     b: String,
-    child: Child,
-    talk: Mutex<Talk>,
-}
-
-struct Talk {
-    commands: ChildStdin,
-    answers: Receiver<String>,
+    dialogue: Dialogue,
 }
 
 impl LinkProcess {
@@ -40,34 +27,17 @@ impl LinkProcess {
         let set = |ways, shape: &crate::wan::Shape| {
             serde_json::to_string(&Command::Set(ways, shape.changes()))
         };
-        let mut child = std::process::Command::new(binary("blaze-testbed")?)
+        let mut command = std::process::Command::new(binary("blaze-testbed")?);
+        command
             .arg("wan")
             .args(["--a", a.0, "--a-device", a.1, "--a-mtu", &link.forward.mtu.to_string()])
             .args(["--b", b.0, "--b-device", b.1, "--b-mtu", &link.back.mtu.to_string()])
             .args(["--seed", &link.seed.to_string()])
             .args(["--run", &set(Ways::Forward, &link.forward)?])
-            .args(["--run", &set(Ways::Back, &link.back)?])
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .context("starting blaze-wan")?;
-        let commands = child.stdin.take().context("no pipe to blaze-wan")?;
-        let out = child.stdout.take().context("no pipe from blaze-wan")?;
-        let (sender, answers) = sync_channel(LINES);
-        std::thread::spawn(move || {
-            let lines = BufReader::new(out).lines().map_while(Result::ok);
-            // It ends with the process, or when nobody asks any more.
-            lines.into_iter().try_for_each(|line| sender.send(line)).ok()
-        });
-        let process = Self {
-            a: link.a.clone(),
-            b: link.b.clone(),
-            child,
-            talk: Mutex::new(Talk { commands, answers }),
-        };
-        let ready = process.talk.lock().answer().context("blaze-wan is not ready")?;
+            .args(["--run", &set(Ways::Back, &link.back)?]);
+        let (dialogue, ready) = Dialogue::start("blaze-wan", command, ANSWER)?;
         anyhow::ensure!(ready["ready"] == true, "blaze-wan says {ready}");
-        Ok(process)
+        Ok(Self { a: link.a.clone(), b: link.b.clone(), dialogue })
     }
 
     pub(super) fn seen_from(&self, a: &str, b: &str) -> Option<Link<'_>> {
@@ -77,26 +47,9 @@ impl LinkProcess {
     }
 
     fn ask(&self, command: &Command) -> anyhow::Result<Value> {
-        let mut talk = self.talk.lock();
-        let command = serde_json::to_string(command)?;
-        writeln!(talk.commands, "{command}").context("blaze-wan has gone")?;
-        let answer = talk.answer().with_context(|| format!("`{command}` to blaze-wan"))?;
-        anyhow::ensure!(answer["ok"] == true, "`{command}`: blaze-wan says {answer}");
+        let answer = self.dialogue.ask(command, ANSWER)?;
+        anyhow::ensure!(answer["ok"] == true, "{command:?}: blaze-wan says {answer}");
         Ok(answer)
-    }
-}
-
-impl Talk {
-    fn answer(&self) -> anyhow::Result<Value> {
-        let line = self.answers.recv_timeout(ANSWER).context("no answer")?;
-        serde_json::from_str(&line).with_context(|| line.clone())
-    }
-}
-
-impl Drop for LinkProcess {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 

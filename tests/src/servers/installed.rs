@@ -13,7 +13,7 @@ pub(super) fn folder() -> PathBuf {
 ///
 /// # Errors
 /// Names the command to run when it is not there.
-pub(super) fn path(relative: &str) -> anyhow::Result<PathBuf> {
+pub(crate) fn path(relative: &str) -> anyhow::Result<PathBuf> {
     let path = folder().join(relative);
     anyhow::ensure!(path.exists(), "{} is missing: run `scripts/services install`", path.display());
     Ok(path)

@@ -12,7 +12,7 @@
 mod certificates;
 mod endpoint;
 mod etcd;
-mod installed;
+pub(crate) mod installed;
 mod kafka;
 mod mongo;
 mod mongo_wire;

@@ -15,5 +15,6 @@ mod dds_namespaces;
 mod layers;
 mod long;
 mod loss;
+mod ros2;
 mod scenario;
 mod support;

@@ -1,6 +1,6 @@
 //! Subscribed channels: their DDS readers, and the threads that empty them.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
 use std::task::{Wake, Waker};
@@ -11,10 +11,11 @@ use parking_lot::{Mutex, RwLock};
 use rustdds::Timestamp;
 use tokio::sync::oneshot;
 
-use super::deliver::{Kind, Progress, deliver};
+use super::deliver::{Kind, Progress, deliver, note_lost};
+use super::doubtful::{Doubtful, Outcome, Room};
 use super::kept::History;
 use super::seen::Seen;
-use super::shared::Shared;
+use super::shared::{Shared, WriterFacts};
 use super::{Admission, Topic};
 use crate::dds::participant::RawReader;
 use crate::dds::reader::StoppableThread;
@@ -33,44 +34,7 @@ const SMALL_DEPTH: u16 = 1024;
 /// The same where they may be large.
 const LARGE_DEPTH: u16 = 32;
 
-/// How long a sample waits until it is known whether it is read.
-pub(super) const LONGEST_DOUBT: Duration = Duration::from_secs(3);
-/// Samples of a channel that wait for that, and their bytes; beyond that the oldest are lost.
-const MAX_DOUBTFUL: usize = 1024;
-const MAX_DOUBTFUL_BYTES: usize = 32 * 1024 * 1024;
-
-/// Samples of which it is not known yet whether they are read, in the order of their arrival.
-#[derive(Default)]
-pub(super) struct Doubtful {
-    samples: VecDeque<(Instant, Kind, Sample)>,
-    bytes: usize,
-}
-
-impl Doubtful {
-    /// Takes one. Returns how many gave way.
-    fn push(&mut self, now: Instant, kind: Kind, sample: Sample) -> u64 {
-        self.bytes += sample.sample.payload().len();
-        self.samples.push_back((now, kind, sample));
-        let mut lost = 0;
-        while self.samples.len() > MAX_DOUBTFUL || self.bytes > MAX_DOUBTFUL_BYTES {
-            lost += u64::from(self.pop().is_some());
-        }
-        lost
-    }
-
-    fn pop(&mut self) -> Option<(Instant, Kind, Sample)> {
-        let (since, kind, sample) = self.samples.pop_front()?;
-        self.bytes -= sample.sample.payload().len();
-        Some((since, kind, sample))
-    }
-
-    fn has(&self, writer: EndpointId) -> bool {
-        self.samples.iter().any(|(_, _, sample)| endpoint_of(sample.writer_guid) == writer)
-    }
-}
-
 /// The readers of a channel, and how far they have come.
-#[derive(Default)]
 pub(super) struct Readers {
     /// By [`Kind`]. A reader that asks for more than a writer offers does not match it.
     pub(super) by_kind: [Option<RawReader>; 3],
@@ -79,7 +43,7 @@ pub(super) struct Readers {
     /// What came of each writer.
     pub(super) seen: HashMap<EndpointId, Seen>,
     pub(super) history: History,
-    doubtful: Doubtful,
+    doubtful: Doubtful<(Kind, Sample)>,
 }
 
 /// A channel that is read.
@@ -119,13 +83,17 @@ impl Channel {
     }
 
     /// Which readers it needs, where writers of these kinds are known; one stands in any case.
-    pub(super) fn wanted(&self, offered: [bool; 3], mixes: bool) -> [bool; 3] {
-        let [durable, reliable, best_effort] = offered;
-        if mixes && self.with_kept {
-            [durable, reliable || !(durable || best_effort), best_effort]
-        } else {
-            [self.with_kept, !self.with_kept, best_effort]
-        }
+    ///
+    /// All readers of a topic share one cache in RustDDS. Where a reliable writer that keeps nothing
+    /// joins one that does, both are read, but a reader that begins at the same moment may then miss
+    /// what is kept.
+    pub(super) fn wanted(&self, [_, reliable, best_effort]: [bool; 3]) -> [bool; 3] {
+        [self.with_kept, reliable || !self.with_kept, best_effort]
+    }
+
+    /// Whether its reader of a kind is the one that reads a writer, as far as that is known.
+    pub(super) fn reads(&self, kind: Kind, writer: Option<WriterFacts>) -> bool {
+        writer.is_none_or(|facts| Kind::of(facts, self.with_kept) == kind)
     }
 
     /// It is read now: whoever waits for that is told, and what came meanwhile is looked for.
@@ -171,7 +139,7 @@ impl Channel {
             again |= self.drain_one(shared, reader, kind, &mut progress, doubtful);
         }
         let clock = |writer: EndpointId| {
-            let facts = shared.writers.read().get(&writer).copied();
+            let facts = shared.facts_of(&writer);
             shared.clock_of(writer, facts)
         };
         let quiet = progress.history.quiet(Instant::now(), clock);
@@ -213,33 +181,47 @@ impl Channel {
     /// Whether it holds messages: those that were kept until their writers are quiet, and those of
     /// which it is not known yet whether they are read. Not to be waited for while a reader is made.
     fn holds_messages(&self) -> bool {
-        let holds = |readers: &Readers| {
-            !(readers.history.is_empty() && readers.doubtful.samples.is_empty())
-        };
+        let holds =
+            |readers: &Readers| !(readers.history.is_empty() && readers.doubtful.is_empty());
         self.readers.try_lock().is_some_and(|readers| holds(&readers))
     }
 
-    /// Delivers what waited until it is known whether it is read. The order of each writer stays.
-    fn resolve(&self, shared: &Shared, doubtful: &mut Doubtful, progress: &mut Progress<'_>) {
-        if doubtful.samples.is_empty() {
-            return;
-        }
-        let now = Instant::now();
-        let mut known: HashMap<EndpointId, Admission> = HashMap::new();
-        let mut rest = Doubtful::default();
-        while let Some((since, kind, sample)) = doubtful.pop() {
-            let writer = endpoint_of(sample.writer_guid);
-            let admission =
-                *known.entry(writer).or_insert_with(|| shared.dialect.admission(&writer));
-            match admission {
-                Admission::Yes => deliver(shared, self, kind, progress, &sample),
-                Admission::Later if now.saturating_duration_since(since) < LONGEST_DOUBT => {
-                    rest.push(since, kind, sample);
-                }
-                Admission::No | Admission::Later => {}
+    /// Delivers what waited until it is known whether it is read.
+    fn resolve(
+        &self,
+        shared: &Shared,
+        doubtful: &mut Doubtful<(Kind, Sample)>,
+        progress: &mut Progress<'_>,
+    ) {
+        let admission = |writer: &EndpointId| shared.dialect.admission(writer);
+        doubtful.resolve(Instant::now(), admission, |(kind, sample), outcome| match outcome {
+            Outcome::Read => deliver(shared, self, kind, progress, &sample),
+            Outcome::Lost => note_lost(shared, self, kind, progress, &sample),
+        });
+    }
+
+    /// Delivers a sample, or lets it wait until it is known whether it is read.
+    fn take(
+        &self,
+        shared: &Shared,
+        kind: Kind,
+        sample: Sample,
+        progress: &mut Progress<'_>,
+        doubtful: &mut Doubtful<(Kind, Sample)>,
+    ) {
+        let writer = endpoint_of(sample.writer_guid);
+        match shared.dialect.admission(&writer) {
+            Admission::Yes if !doubtful.has(&writer) => {
+                deliver(shared, self, kind, progress, &sample);
             }
+            Admission::Yes | Admission::Later if self.reads(kind, shared.facts_of(&writer)) => {
+                let bytes = sample.sample.payload().len();
+                for (kind, lost) in doubtful.push(Instant::now(), writer, (kind, sample), bytes) {
+                    note_lost(shared, self, kind, progress, &lost);
+                }
+            }
+            Admission::Yes | Admission::Later | Admission::No => {}
         }
-        *doubtful = rest;
     }
 
     /// Returns whether there may be more.
@@ -249,25 +231,12 @@ impl Channel {
         reader: &RawReader,
         kind: Kind,
         progress: &mut Progress<'_>,
-        doubtful: &mut Doubtful,
+        doubtful: &mut Doubtful<(Kind, Sample)>,
     ) -> bool {
         reader.drain_read_notifications();
         for _ in 0..TURN {
             match reader.try_take_one() {
-                Ok(Some(sample)) => {
-                    let writer = endpoint_of(sample.writer_guid);
-                    let admission = match shared.dialect.admission(&writer) {
-                        Admission::Yes if doubtful.has(writer) => Admission::Later,
-                        admission => admission,
-                    };
-                    match admission {
-                        Admission::Yes => deliver(shared, self, kind, progress, &sample),
-                        Admission::Later => {
-                            self.note_lost(doubtful.push(Instant::now(), kind, sample));
-                        }
-                        Admission::No => {}
-                    }
-                }
+                Ok(Some(sample)) => self.take(shared, kind, sample, progress, doubtful),
                 Ok(None) => return false,
                 Err(error) => {
                     shared.counts.lock().malformed += 1;
@@ -307,6 +276,7 @@ pub(super) struct Channels {
     ready: [Arc<Ready>; 2],
     closed: AtomicBool,
     next: AtomicU64,
+    doubtful: Room,
 }
 
 impl Channels {
@@ -337,7 +307,13 @@ impl Channels {
                 large: options.large,
                 with_kept: options.with_kept,
                 senders: Mutex::default(),
-                readers: Mutex::default(),
+                readers: Mutex::new(Readers {
+                    by_kind: [None, None, None],
+                    opened: None,
+                    seen: HashMap::new(),
+                    history: History::default(),
+                    doubtful: Doubtful::new(Arc::clone(&self.doubtful)),
+                }),
                 ids: Mutex::default(),
                 waiting: Mutex::default(),
                 is_ready: AtomicBool::new(false),
@@ -415,8 +391,9 @@ impl Channels {
     pub(super) fn take_readers(&self) -> Vec<RawReader> {
         let take = |channel: Arc<Channel>| {
             *channel.ids.lock() = [None; 3];
-            let readers = std::mem::take(&mut *channel.readers.lock());
-            readers.by_kind
+            let mut readers = channel.readers.lock();
+            readers.opened = None;
+            std::mem::take(&mut readers.by_kind)
         };
         self.list().into_iter().flat_map(take).flatten().collect()
     }

@@ -61,6 +61,27 @@ impl Progress<'_> {
     }
 }
 
+/// Counts a sample as lost that waited in vain.
+pub(super) fn note_lost(
+    shared: &Shared,
+    channel: &Channel,
+    kind: Kind,
+    progress: &mut Progress<'_>,
+    sample: &Sample,
+) {
+    let writer = endpoint_of(sample.writer_guid());
+    let facts = shared.facts_of(&writer);
+    let since_opened = sample.receive_instant >= progress.opened;
+    if !since_opened || !channel.reads(kind, facts) {
+        return;
+    }
+    let seen = progress.of_writer(shared, writer);
+    if let Some(missing) = seen.take(i64::from(sample.sequence_number), since_opened) {
+        let repairs = facts.is_some_and(|facts| facts.reliable);
+        channel.note_lost(1 + if repairs { missing } else { 0 });
+    }
+}
+
 /// Takes a sample of another participant, or what an own writer keeps. Own live messages come by
 /// another way.
 pub(super) fn deliver(
@@ -71,8 +92,8 @@ pub(super) fn deliver(
     sample: &Sample,
 ) {
     let writer = endpoint_of(sample.writer_guid());
-    let facts = shared.writers.read().get(&writer).copied();
-    if facts.is_some_and(|facts| Kind::of(facts, channel.with_kept) != kind) {
+    let facts = shared.facts_of(&writer);
+    if !channel.reads(kind, facts) {
         // Another reader has it, complete.
         return;
     }

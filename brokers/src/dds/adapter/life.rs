@@ -215,7 +215,7 @@ fn make_missing(
     }
     for channel in shared.channels.list() {
         let offered = shared.offered.read().get(&*channel.topic.name).copied().unwrap_or_default();
-        generation.open(&channel, channel.wanted(offered, shared.dialect.mixes_durability()))?;
+        generation.open(&channel, channel.wanted(offered))?;
     }
     Ok(())
 }

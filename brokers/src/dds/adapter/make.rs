@@ -11,6 +11,7 @@ use rustdds::Timestamp;
 use super::Companion;
 use super::channel::{Channel, Readers};
 use super::deliver::Kind;
+use super::doubtful::LONGEST_DOUBT;
 use super::near::Near;
 use super::presence::Presence;
 use super::probe::Probe;
@@ -25,6 +26,9 @@ use crate::dds::{
 
 /// Between two questions to the hosts of other participants.
 const PROBE: Duration = Duration::from_millis(100);
+/// How long it is known what a writer offered, after it was found last. They are looked for once a
+/// second.
+const KNOWN_FOR: Duration = LONGEST_DOUBT.saturating_add(Duration::from_secs(1));
 
 /// Fields drop in this order: users first, the participant last.
 pub(super) struct Generation {
@@ -46,7 +50,8 @@ impl Generation {
         let farewell =
             Farewell::new(shared.address, participant.port()).map_err(create_error("socket"))?;
         let near = Near::of_interface(shared.address);
-        let presence = Arc::new(Mutex::new(Presence::new(near)));
+        let presence =
+            Arc::new(Mutex::new(Presence::new(near, shared.dialect.sign_topic().is_some())));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
             watch: participant.watch_endpoints(
@@ -85,6 +90,7 @@ impl Generation {
             durable: profile.transient_local,
             own: true,
             signs: true,
+            found: now,
         };
         shared.writers.write().insert(writer.id(), facts);
         slot.put(writer, now);
@@ -172,20 +178,24 @@ impl Generation {
 fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
     let mut offered: HashMap<String, [bool; 3]> = HashMap::new();
-    shared.dialect.note_endpoints(endpoints);
     let signs = shared.dialect.sign_topic();
     let sign =
         |writer: &FoundEndpoint| (Some(&*writer.topic) == signs).then(|| writer.participant());
+    let now = Instant::now();
     let alive: HashSet<GuidPrefix> = endpoints.writers.iter().filter_map(sign).collect();
     {
         let mut writers = shared.writers.write();
-        writers.retain(|_, facts| facts.own);
+        // Samples of those that have left may still wait.
+        let is_recent =
+            |facts: &WriterFacts| now.saturating_duration_since(facts.found) < KNOWN_FOR;
+        writers.retain(|_, facts| facts.own || is_recent(facts));
         for writer in &endpoints.writers {
             let facts = WriterFacts {
                 reliable: writer.is_reliable(),
                 durable: writer.is_durable(),
                 own: false,
                 signs: alive.contains(&writer.participant()),
+                found: now,
             };
             writers.insert(writer.id, facts);
             offered.entry(writer.topic.clone()).or_default()[Kind::of(facts, true) as usize] = true;
@@ -194,6 +204,10 @@ fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpo
     let changed = *shared.offered.read() != offered;
     if changed {
         *shared.offered.write() = offered;
+    }
+    // Last: readers that are wanted because of it are made for what is offered now.
+    shared.dialect.note_endpoints(endpoints);
+    if changed {
         shared.wake_lifecycle();
     }
 }

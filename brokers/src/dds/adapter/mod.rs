@@ -14,6 +14,7 @@
 
 mod channel;
 mod deliver;
+mod doubtful;
 mod kept;
 mod life;
 mod make;
@@ -30,7 +31,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use blaze_domain::DropReason;
+use blaze_domain::{DropReason, WriterId};
 use parking_lot::Mutex;
 use rustdds::WriteOptionsBuilder;
 use tokio::sync::watch;
@@ -51,7 +52,9 @@ use shared::Shared;
 
 pub(crate) use channel::MAX_CHANNELS;
 pub(crate) use deliver::nanos;
+pub(crate) use doubtful::LONGEST_DOUBT;
 pub(crate) use make::Others;
+pub(crate) use send::MAX_ORIGINS;
 pub use shared::MAX_QUEUE_BYTES;
 
 /// How long closing delivers what was taken.
@@ -88,7 +91,7 @@ pub(crate) struct Encoded {
 pub(crate) enum Admission {
     Yes,
     No,
-    /// It is not known yet: they wait, at most [`channel::LONGEST_DOUBT`].
+    /// It is not known yet: they wait, at most [`LONGEST_DOUBT`].
     Later,
 }
 
@@ -113,11 +116,6 @@ pub(crate) trait Dialect: Send + Sync + 'static {
         participant: &Participant,
         now: Instant,
     ) -> Result<Box<dyn Companion>, DdsError>;
-
-    /// Whether writers of one topic may keep samples for late joiners, and others not.
-    fn mixes_durability(&self) -> bool {
-        false
-    }
 
     /// The topic on which participants of this kind tell that they live.
     fn sign_topic(&self) -> Option<&'static str> {
@@ -340,6 +338,23 @@ impl Drop for Adapter {
 
 /// Writes one topic.
 pub(crate) type TopicPublisher = LanePublisher<Target, Arc<Shared>>;
+
+impl TopicPublisher {
+    /// Nothing is written before what waits for another writer now.
+    pub(crate) fn wait_for(&self, other: &Self) {
+        self.lane.to().wait_for(other.lane.backlog());
+    }
+
+    /// Makes the writer of an origin of a transient_local topic before it has a message.
+    pub(crate) fn prepare(&self, origin: WriterId) {
+        self.lane.to().slot_of_origin(&self.admission, origin);
+    }
+
+    /// Whether its writers stand, and have met so many readers, where that takes less than `limit`.
+    pub(crate) fn has_met(&self, readers: usize, now: Instant, limit: Duration) -> bool {
+        self.lane.to().has_met(readers, now, limit)
+    }
+}
 
 impl OutboxAdmission for Arc<Shared> {
     fn is_shut(&self) -> bool {

@@ -6,6 +6,9 @@
 //! | a newer participant has their port, at each of their addresses that mean the same here (`near`) | dead |
 //! | a writer's window is full, and they have been silent for 2 s (those that send signs of life) | given up |
 //! | a writer's window has been full for 2 s, they read its topic and never send signs of life | given up |
+//!
+//! Only the first counts where no participant sends signs of life (ROS 2): implementations share one
+//! port between participants there, and a slow reader is no dead one. The others end with their lease.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -40,14 +43,16 @@ struct Peer {
 #[derive(Debug)]
 pub(super) struct Presence {
     near: Near,
+    /// Participants of this kind send signs of life.
+    have_signs: bool,
     peers: BTreeMap<GuidPrefix, Peer>,
     next: u64,
     gone: VecDeque<(GuidPrefix, Instant)>,
 }
 
 impl Presence {
-    pub(super) fn new(near: Near) -> Self {
-        Self { near, peers: BTreeMap::new(), next: 0, gone: VecDeque::new() }
+    pub(super) fn new(near: Near, have_signs: bool) -> Self {
+        Self { near, have_signs, peers: BTreeMap::new(), next: 0, gone: VecDeque::new() }
     }
 
     /// Takes over which readers there are.
@@ -104,6 +109,9 @@ impl Presence {
     /// Those whose port a newer one has. One that shares but some addresses with others is another
     /// host's, or has one of its own beside theirs.
     pub(super) fn superseded(&self) -> Vec<GuidPrefix> {
+        if !self.have_signs {
+            return Vec::new();
+        }
         let mut newest: HashMap<SocketAddr, u64> = HashMap::new();
         for peer in self.peers.values() {
             for socket in &peer.sockets {
@@ -123,7 +131,7 @@ impl Presence {
     /// Those that are given up, since the windows of some topics have been full: each topic and
     /// since when.
     pub(super) fn given_up(&self, now: Instant, full: &[(&str, Instant)]) -> Vec<GuidPrefix> {
-        if full.is_empty() {
+        if full.is_empty() || !self.have_signs {
             return Vec::new();
         }
         let passed = |at: Instant| now.saturating_duration_since(at);
@@ -224,7 +232,7 @@ mod tests {
     }
 
     fn presence(address: [u8; 4], mask: [u8; 4]) -> Presence {
-        Presence::new(Near::new(address.into(), mask.into()))
+        Presence::new(Near::new(address.into(), mask.into()), true)
     }
 
     fn on_loopback() -> Presence {
@@ -290,6 +298,17 @@ mod tests {
         assert_eq!(presence.superseded(), [prefix(9)]);
         presence.set_readers(&[reader(5, "a", 2), reader(1, "b", 1)]);
         assert_eq!((presence.superseded(), presence.count()), (vec![], 2));
+    }
+
+    #[test]
+    fn nobody_is_given_up_where_no_signs_of_life_are_sent() {
+        let now = Instant::now();
+        let mut presence = Presence { have_signs: false, ..on_loopback() };
+        presence.set_readers(&[reader(1, "a", 1), reader(2, "a", 2)]);
+        presence.set_readers(&[reader(1, "a", 1), reader(2, "a", 2), reader(3, "a", 1)]);
+        assert_eq!(presence.superseded(), [], "participants of one process share a socket");
+        assert_eq!(presence.given_up(now + Duration::from_secs(60), &[("a", now)]), []);
+        assert_eq!(presence.sockets().count(), 3, "their host is still asked");
     }
 
     #[test]

@@ -15,7 +15,7 @@ use super::shared::Shared;
 use super::slot::{Attempt, Slot, SlotKey};
 use crate::dds::DdsError;
 use crate::dds::reader::StoppableThread;
-use crate::outbox::{Body, Fate, Waiting};
+use crate::outbox::{Backlog, Body, Fate, Waiting};
 use crate::port::PublisherOptions;
 use crate::wake::wait;
 
@@ -37,7 +37,7 @@ const LARGE_COST: usize = 64 * 1024;
 const IDLE: Duration = Duration::from_millis(100);
 /// Origins of one transient_local publisher that have a writer each; the one that wrote longest ago
 /// gives way.
-const MAX_ORIGINS: usize = 256;
+pub(crate) const MAX_ORIGINS: usize = 256;
 /// Most samples that are kept per origin.
 const MAX_DEPTH: u32 = 1024;
 
@@ -48,24 +48,17 @@ pub(crate) struct Target {
     /// The writer of all origins; none where each has its own.
     slot: Option<Arc<Slot>>,
     origins: Mutex<LruCache<WriterId, Arc<Slot>>>,
+    /// Messages that are written first.
+    after: Mutex<Vec<Backlog>>,
 }
 
 impl Target {
     pub(super) fn new(shared: &Arc<Shared>, topic: Topic, options: PublisherOptions) -> Self {
         let depth = depth_of(options.depth);
-        let key = SlotKey {
-            topic,
-            reliable: options.reliable || depth > 0,
-            large: options.large,
-            depth: 0,
-            origin: None,
-        };
-        let target = Self::with_writer(shared, key);
-        Self {
-            key: SlotKey { depth, ..target.key },
-            slot: target.slot.filter(|_| depth == 0),
-            ..target
-        }
+        let reliable = options.reliable || depth > 0;
+        let key = SlotKey { topic, reliable, large: options.large, depth, origin: None };
+        let slot = (depth == 0).then(|| shared.slots.get(key.clone()));
+        Self::of(shared, key, slot)
     }
 
     /// One writer for all that is published, which keeps the last `depth` for late joiners, whoever
@@ -73,19 +66,37 @@ impl Target {
     pub(super) fn keeping(shared: &Arc<Shared>, topic: Topic, depth: u32) -> Self {
         let key =
             SlotKey { topic, reliable: true, large: false, depth: depth_of(depth), origin: None };
-        Self::with_writer(shared, key)
+        let slot = shared.slots.get(key.clone());
+        Self::of(shared, key, Some(slot))
     }
 
-    fn with_writer(shared: &Arc<Shared>, key: SlotKey) -> Self {
+    fn of(shared: &Arc<Shared>, key: SlotKey, slot: Option<Arc<Slot>>) -> Self {
         static IDS: AtomicU64 = AtomicU64::new(0);
-        let slot = shared.slots.get(key.clone());
         shared.wake_lifecycle();
         Self {
             id: IDS.fetch_add(1, Ordering::Relaxed),
             key,
-            slot: Some(slot),
+            slot,
             origins: Mutex::new(LruCache::unbounded()),
+            after: Mutex::default(),
         }
+    }
+
+    /// Nothing is written before these messages are.
+    pub(super) fn wait_for(&self, others: Backlog) {
+        self.after.lock().push(others);
+    }
+
+    fn may_write(&self) -> bool {
+        let mut after = self.after.lock();
+        after.retain(|others| !others.is_empty());
+        after.is_empty()
+    }
+
+    /// Whether its writers stand, and have met so many readers, where that takes less than `limit`.
+    pub(super) fn has_met(&self, readers: usize, now: Instant, limit: Duration) -> bool {
+        let met = |slot: &Arc<Slot>| slot.has_met(readers, now, limit);
+        self.slot.iter().all(met) && self.origins.lock().iter().all(|(_, slot)| met(slot))
     }
 
     /// The writer of a message.
@@ -101,6 +112,11 @@ impl Target {
             // Without an origin there is nothing to keep for late joiners.
             return shared.slots.get(SlotKey { depth: 0, ..self.key.clone() });
         };
+        self.slot_of_origin(shared, origin)
+    }
+
+    /// The writer of an origin, where each has its own.
+    pub(super) fn slot_of_origin(&self, shared: &Shared, origin: WriterId) -> Arc<Slot> {
         let mut origins = self.origins.lock();
         if let Some(slot) = origins.get(&origin) {
             return Arc::clone(slot);
@@ -150,7 +166,10 @@ impl Sender {
             TURN_MESSAGES,
             TURN_BYTES,
             true,
-            |target| (!self.held.contains_key(&target.id)).then_some(usize::MAX),
+            |target| {
+                let is_free = !self.held.contains_key(&target.id) && target.may_write();
+                is_free.then_some(usize::MAX)
+            },
             &mut self.taken,
         );
         // Until they are written they are nowhere else.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread::Thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use parking_lot::{Mutex, RwLock};
 
@@ -41,6 +41,8 @@ pub(super) struct WriterFacts {
     pub(super) own: bool,
     /// Its participant sends signs of life.
     pub(super) signs: bool,
+    /// When it was found last.
+    pub(super) found: Instant,
 }
 
 pub(crate) struct Shared {
@@ -89,6 +91,11 @@ impl Shared {
             #[cfg(feature = "fault-injection")]
             fault: Mutex::default(),
         })
+    }
+
+    /// What a writer offers, if it is known.
+    pub(super) fn facts_of(&self, writer: &EndpointId) -> Option<WriterFacts> {
+        self.writers.read().get(writer).copied()
     }
 
     /// What is known of a writer's clock.

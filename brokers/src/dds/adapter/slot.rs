@@ -16,6 +16,8 @@ const MEET: Duration = Duration::from_millis(300);
 /// How long after the first reader was found samples may not reach it, since it has not found the
 /// writer.
 const SETTLE: Duration = Duration::from_millis(20);
+/// How long a writer stands before it takes over from another: the readers have found it by then.
+const STANDS: Duration = Duration::from_millis(100);
 /// How long a writer stays after its last user at least, and at most while readers have not
 /// acknowledged.
 const LINGER: Duration = Duration::from_millis(300);
@@ -141,6 +143,14 @@ impl Slot {
     pub(super) fn put(&self, writer: Writer, now: Instant) {
         *self.state.lock() =
             State { writer: Some(Arc::new(writer)), made: Some(now), ..State::default() };
+    }
+
+    /// Whether its writer stands, and has met so many readers, where that takes less than `limit`.
+    pub(super) fn has_met(&self, readers: usize, now: Instant, limit: Duration) -> bool {
+        let state = self.state.lock();
+        let (Some(writer), Some(made)) = (&state.writer, state.made) else { return false };
+        let age = now.saturating_duration_since(made);
+        age >= limit || (age >= STANDS && writer.has_met(readers))
     }
 
     /// Since when its window has been full.

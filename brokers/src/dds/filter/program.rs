@@ -4,7 +4,9 @@
 //! drops the packet; RustDDS refuses such a datagram as a whole, too.
 
 use super::assembler::{Assembler, Instruction, Op, Test};
-use super::steps::{DROP, Limits, full_step, packed_step, pass_at_end, quick_step};
+use super::steps::{
+    DROP, Limits, PASS, full_step, on_announcement, packed_step, pass_at_end, quick_step,
+};
 
 const UDP_HEADER: u32 = 8;
 const RTPS_HEADER: u32 = 20;
@@ -43,7 +45,7 @@ impl Shape {
     /// datagram, and heartbeats and acknowledgements of many endpoints. Fast DDS ends a datagram
     /// with a fragment by a heartbeat and a submessage of its own. 4,070 instructions, which fit
     /// into 90,000 bytes and not into 80,000.
-    const LARGE_ANY_VENDOR: Self = Self { first: 1, quick: 118, packed: 22, last: 2 };
+    const LARGE_ANY_VENDOR: Self = Self { first: 1, quick: 114, packed: 22, last: 2 };
     const SMALL_ANY_VENDOR: Self = Self { first: 2, quick: 16, packed: 3, last: 1 };
 
     /// The large and the small shape for samples.
@@ -66,6 +68,8 @@ pub(in super::super) struct Samples {
     /// Whether other implementations than RustDDS send them: in fragments of at least 256 bytes,
     /// not of exactly as many, and with more kinds of submessages in one datagram.
     pub(in super::super) any_vendor: bool,
+    /// Whether announcements are repeated to RustDDS: it gets nothing but the header of others.
+    pub(in super::super) repeated: bool,
 }
 
 impl Samples {
@@ -90,6 +94,9 @@ pub(super) fn program(shape: Shape, samples: Samples) -> Option<Vec<Instruction>
     asm.when(Test::Equal, MAGIC, is_rtps);
     asm.op(Op::Return, DROP);
     asm.place(is_rtps);
+    if samples.repeated {
+        trim_announcements(&mut asm);
+    }
     asm.op(Op::IndexConstant, UDP_HEADER + RTPS_HEADER);
     let limits = samples.limits();
     for _ in 0..shape.first {
@@ -109,5 +116,39 @@ pub(super) fn program(shape: Shape, samples: Samples) -> Option<Vec<Instruction>
     }
     pass_at_end(&mut asm);
     asm.op(Op::Return, DROP);
+    asm.finish()
+}
+
+/// Cuts announcements off behind the header, which tells RustDDS whence others come. It is no drop,
+/// and not counted as one.
+fn trim_announcements(asm: &mut Assembler) {
+    let [announcement, other] = [(); 2].map(|()| asm.label());
+    on_announcement(asm, UDP_HEADER + RTPS_HEADER, announcement, other);
+    asm.place(announcement);
+    asm.op(Op::Return, UDP_HEADER + RTPS_HEADER);
+    asm.place(other);
+}
+
+/// Passes announcements alone.
+pub(super) fn announcements() -> Option<Vec<Instruction>> {
+    choice(UDP_HEADER, PASS, DROP)
+}
+
+/// Of two sockets of a port the second gets announcements, the first all else. Such a program sees
+/// no UDP header.
+pub(super) fn steering() -> Option<Vec<Instruction>> {
+    choice(0, 1, 0)
+}
+
+fn choice(begin: u32, for_announcement: u32, for_other: u32) -> Option<Vec<Instruction>> {
+    let mut asm = Assembler::default();
+    let [announcement, other] = [(); 2].map(|()| asm.label());
+    asm.op(Op::LoadWordAt, begin);
+    asm.unless(Test::Equal, MAGIC, other);
+    on_announcement(&mut asm, begin + RTPS_HEADER, announcement, other);
+    asm.place(announcement);
+    asm.op(Op::Return, for_announcement);
+    asm.place(other);
+    asm.op(Op::Return, for_other);
     asm.finish()
 }

@@ -3,7 +3,7 @@
 use super::assembler::{Assembler, Label, Op, Test};
 
 /// Returned for what passes: more than any datagram has.
-const PASS: u32 = 0x4_0000;
+pub(super) const PASS: u32 = 0x4_0000;
 pub(super) const DROP: u32 = 0;
 
 const PAD: u32 = 0x01;
@@ -63,6 +63,36 @@ pub(super) fn pass_at_end(asm: &mut Assembler) {
     asm.unless(Test::EqualsIndex, 0, more);
     asm.op(Op::Return, PASS);
     asm.place(more);
+}
+
+/// Submessages of an announcement: its DATA, behind time and destination at most.
+const ANNOUNCEMENT: usize = 3;
+/// Writer of announcements, and where a DATA names its writer.
+const SPDP_WRITER: u32 = 0x0001_00c2;
+const WRITER: u32 = 12;
+
+/// Goes on at `announcement` or `other`. The submessages begin at `begin`. What RustDDS gets
+/// repeated begins with another submessage than those of announcements, and so is none.
+pub(super) fn on_announcement(asm: &mut Assembler, begin: u32, announcement: Label, other: Label) {
+    let data = asm.label();
+    asm.op(Op::IndexConstant, begin);
+    for _ in 0..ANNOUNCEMENT {
+        let skip = asm.label();
+        asm.op(Op::LoadLength, 0);
+        asm.when(Test::EqualsIndex, 0, other);
+        asm.op(Op::LoadWord, 0);
+        asm.op(Op::And, 0xff00_0000 | LITTLE);
+        asm.when(Test::Equal, DATA << 24 | LITTLE, data);
+        asm.when(Test::Equal, INFO_TS << 24 | LITTLE, skip);
+        asm.unless(Test::Equal, INFO_DST << 24 | LITTLE, other);
+        asm.place(skip);
+        skip_little(asm);
+    }
+    asm.jump(other);
+    asm.place(data);
+    asm.op(Op::LoadWord, WRITER);
+    asm.when(Test::Equal, SPDP_WRITER, announcement);
+    asm.jump(other);
 }
 
 /// Swaps the two bytes of A, which has no others.

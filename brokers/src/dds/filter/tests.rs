@@ -67,7 +67,7 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
 }
 
 const LARGEST: u32 = 60 * 1024 + 8;
-const SAMPLES: Samples = Samples { largest: LARGEST, repaired: false, any_vendor: false };
+const SAMPLES: Samples = Samples { largest: LARGEST, repaired: false, any_vendor: false, repeated: false };
 const ANY_VENDOR: Samples = Samples { any_vendor: true, ..SAMPLES };
 
 fn passes_shape(shape: Shape, samples: Samples, datagram: &[u8]) -> bool {
@@ -389,7 +389,8 @@ fn random_messages_agree_with_a_plain_walk() {
 fn the_kernels_list_is_read() {
     let line = "  512: 0100007F:306B 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 4711 2 \
                 0000000000000000 23";
-    let expected = UdpSocketLine { port: 12_395, inode: 4711, dropped: 23 };
+    let address = Ipv4Addr::LOCALHOST;
+    let expected = UdpSocketLine { address, port: 12_395, inode: 4711, dropped: 23 };
     assert_eq!(UdpSocketLine::parse(line), Some(expected));
     assert_eq!(UdpSocketLine::parse("  sl  local_address rem_address   st tx_queue"), None);
     assert_eq!(UdpSocketLine::parse(""), None);
@@ -435,7 +436,7 @@ fn the_kernel_takes_the_filters_and_drops_what_it_must() {
 
 #[test]
 fn fragments_of_large_samples_are_asked_for_where_they_are_repaired() {
-    let samples = |repaired| Samples { largest: 16 << 20, repaired, any_vendor: false };
+    let samples = |repaired| Samples { largest: 16 << 20, repaired, any_vendor: false, repeated: false };
     for e in BOTH {
         for (fragment, passes) in [(1, true), (1023, true), (1024, false), (65_535, false)] {
             let packet = message(&[e.nack_frag(1, fragment, 1)]);

@@ -3,7 +3,7 @@
 use blaze_domain::{FlowId, Scope, WhyCode};
 
 use super::worlds::{ask, id, list, offer, rows, topic, ways, world};
-use crate::plan::{PlanRules, Target, TopicPlan, plan_topic};
+use crate::plan::{PlanRules, Survey, Target, TopicPlan, network, plan_topic};
 use crate::world::World;
 
 fn plan_of(world: &World, flow: &str) -> TopicPlan {
@@ -118,6 +118,66 @@ fn requests_to_services_go_to_the_flow_of_their_server() {
         assert_eq!(ways(&plan), ["layer>ros2"], "each writes what names it");
         assert!(!plan.bridges[0].lane.natives.write(Scope::Layer, 1, "e", "a"));
     }
+}
+
+/// The same world, in which all is said of another topic.
+fn renamed(world: &World, name: &str) -> World {
+    let mut world = world.clone();
+    for view in world.flows.values_mut() {
+        if let Some(entry) = view.topics.remove(&topic()) {
+            view.topics.insert(name.parse().unwrap(), entry);
+        }
+    }
+    world
+}
+
+#[test]
+fn a_network_with_a_server_of_its_own_asks_no_other_one() {
+    let plan = |lines: &[&str], flow: &str| {
+        let world = World { me: id(flow), ..renamed(&world(lines), "add/_request") };
+        ways(&plan_topic(&world, &"add/_request".parse().unwrap(), &PlanRules::default(), None))
+    };
+    let away = ["e/a net1 ros2+", "c/b net2 ros2-"];
+    assert_eq!(plan(&away, "e/a"), ["ros2>c/b"]);
+    assert_eq!(plan(&["e/a net1 ros2+ ros2-", "c/b net2 ros2-"], "e/a"), [""; 0]);
+    let beside = ["e/a@1 net1 ros2+", "e/x@1 net1 ros2-", "c/b net2 ros2-"];
+    assert_eq!(plan(&beside, "e/a"), [""; 0], "another flow of the network has the server");
+}
+
+#[test]
+fn requests_may_go_to_all_flows_with_a_server() {
+    let servers = |lines: &[&str], name: &str| {
+        let world = renamed(&world(lines), name);
+        let servers = network::servers(&Survey::new(&world), &name.parse().unwrap());
+        (servers.here, servers.elsewhere)
+    };
+    let lines = ["e/a net1 ros2+", "e/b net3 ros2-", "c/b net2 ros2-", "c/x net4 ros2- down"];
+    let expected = (vec![id("e/b")], vec![id("c/b")]);
+    assert_eq!(servers(&lines, "add/_request"), expected);
+    assert_eq!(servers(&lines, "add/_reply"), (Vec::new(), Vec::new()));
+}
+
+#[test]
+fn what_others_offer_in_a_type_shows_on_the_network_once() {
+    let shown = |lines: &[&str], types: &[(&str, &str, &str)]| -> Vec<FlowId> {
+        let mut world = world(lines);
+        for (flow, scope, type_name) in types {
+            offer(&mut world, flow, scope).type_name = (*type_name).to_owned();
+        }
+        let shows = |me: &&FlowId| {
+            let world = World { me: (*me).clone(), ..world.clone() };
+            network::shown(&Survey::new(&world), &topic()).is_some()
+        };
+        world.flows.keys().filter(shows).cloned().collect()
+    };
+    let (a, t) = ([id("e/a")], "p/msg/T");
+    assert_eq!(shown(&["c/b net2 ros2+", "e/a net1"], &[("c/b", "ros2", t)]), a);
+    assert_eq!(shown(&["c/b node+", "e/a net1"], &[("c/b", "node", t)]), a);
+    assert_eq!(shown(&["c/b node+", "e/a net1"], &[]), [], "without a type");
+    assert_eq!(shown(&["e/a net1 node+", "e/b net1"], &[("e/a", "node", t)]), a, "its own");
+    assert_eq!(shown(&["e/a net1 ros2+", "e/b net1"], &[("e/a", "ros2", t)]), [], "it is there");
+    let two = ["c/b node+", "e/a net1", "e/b net1"];
+    assert_eq!(shown(&two, &[("c/b", "node", t)]).len(), 1, "one flow of the network shows it");
 }
 
 #[test]

@@ -5,4 +5,5 @@ mod dds;
 mod kafka;
 mod memory;
 mod redis;
+mod ros2;
 mod support;

@@ -1,7 +1,7 @@
 //! Bridges to and from ROS 2, and copies as JSON.
 
 use super::*;
-use crate::plan::network::Natives;
+use crate::plan::network::{Natives, Servers};
 
 fn to_ros2(from: Scope, natives: Natives) -> Bridge {
     Bridge { lane: LaneSpec { natives, ..lane_spec() }, ..bridge(from, Target::Ros2) }
@@ -52,6 +52,29 @@ fn a_message_for_one_flow_is_written_by_that_flow_and_stays_in_its_layer() {
         bench.take(Scope::Node, vec![Content::Frame(message)]);
         assert_eq!((bench.written().len(), bench.submitted().len()), (written, sent), "{to:?}");
     }
+}
+
+#[test]
+fn a_request_goes_to_one_server_and_stays_with_it() {
+    let to_cloud = || vec![bridge(Scope::Ros2, to_cloud())];
+    let mut bench = Bench::new(to_cloud());
+    let info = |here: &[&str], elsewhere: &[&str]| TopicInfo {
+        servers: Servers { here: flows(here), elsewhere: flows(elsewhere) },
+        ..TopicInfo::default()
+    };
+    let ask = |bench: &mut Bench, sequence| {
+        let before = bench.link.submitted.len();
+        bench.take(Scope::Ros2, vec![Content::Frame(frame(1, sequence, "robot-1", 0, 1))]);
+        bench.link.submitted.len() - before
+    };
+    bench.apply(to_cloud(), info(&[], &["cloud/cloud-1"]));
+    assert_eq!(ask(&mut bench, 1), 1);
+    bench.apply(to_cloud(), info(&["edge/robot-2"], &["cloud/cloud-1"]));
+    assert_eq!(ask(&mut bench, 2), 1, "where it has gone before");
+    bench.apply(to_cloud(), info(&["edge/robot-2"], &[]));
+    assert_eq!(ask(&mut bench, 3), 0, "that has no server any more");
+    bench.apply(to_cloud(), info(&["edge/robot-2"], &["cloud/cloud-1"]));
+    assert_eq!(ask(&mut bench, 4), 0);
 }
 
 #[test]

@@ -1,0 +1,315 @@
+//! The adapter of ROS 2, with participants on RustDDS in the place of nodes.
+
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use blaze_brokers::dds::{
+    Cdr, EndpointId, Participant, ParticipantConfig, Profile, Reader, Terms, Writer, Written,
+};
+use blaze_brokers::ros2::{GidLength, Network, Ros2Broker, Ros2Config};
+use blaze_brokers::{
+    Broker, Content, Health, PublisherOptions, Received, SubscribeOptions, Subscription,
+};
+use blaze_domain::{Origin, WriterId};
+use blaze_proto::{Frame, Header};
+use blaze_tests::flow::free_domain;
+use parking_lot::Mutex;
+use rustdds::WriteOptionsBuilder;
+
+use super::support::{DEADLINE, WITH_KEPT, eventually, wait_for};
+
+/// The type of all topics: a message of one byte.
+const TYPE: &str = "std_msgs::msg::dds_::UInt8_";
+const ENCODING: &str = "application/cdr; type=std_msgs/msg/UInt8";
+
+const RELIABLE: PublisherOptions = PublisherOptions { depth: 0, reliable: true, large: false };
+
+fn reliable(depth: u16) -> Profile {
+    Profile { reliable: true, window: 4096, ..Profile::best_effort(depth) }
+}
+
+fn keeping(depth: u16) -> Profile {
+    Profile { transient_local: true, ..reliable(depth) }
+}
+
+fn cdr(number: u8) -> Vec<u8> {
+    vec![0, 1, 0, 0, number]
+}
+
+/// A flow's adapter in a domain of its own.
+struct Net {
+    domain: u16,
+    broker: Ros2Broker,
+}
+
+impl Net {
+    async fn start() -> Self {
+        let domain = free_domain().unwrap();
+        let broker = Ros2Broker::open(Ros2Config {
+            flow: "edge/robot-1".parse().unwrap(),
+            domain,
+            interface: Ipv4Addr::LOCALHOST,
+            namespace: String::new(),
+            peers: Vec::new(),
+            gid: GidLength::Short,
+        })
+        .unwrap();
+        wait_for(&broker, Health::Up).await;
+        Self { domain, broker }
+    }
+
+    fn node(&self) -> Participant {
+        Participant::start(ParticipantConfig::new(self.domain, Ipv4Addr::LOCALHOST)).unwrap()
+    }
+
+    /// Waits until the network is as wanted.
+    async fn network(&self, what: &str, is_so: impl Fn(&Network) -> bool) {
+        let mut network = self.broker.network();
+        let waited = tokio::time::timeout(DEADLINE, network.wait_for(|network| is_so(network)));
+        assert!(waited.await.is_ok(), "{what}: {:?}", self.broker.network().borrow());
+    }
+
+    /// Waits until writers are found, and takes their messages.
+    async fn own(&self, writers: &[EndpointId]) {
+        let has = |network: &Network, id| network.endpoints.iter().any(|it| it.id == id);
+        self.network("found", |network| writers.iter().all(|id| has(network, *id))).await;
+        self.broker.set_owned(writers.iter().map(|id| (*id, true)).collect());
+    }
+
+    async fn read(&self, topic: &str, options: SubscribeOptions) -> Subscription {
+        self.broker.subscribe(&topic.parse().unwrap(), options).await.unwrap()
+    }
+}
+
+fn put(writer: &Writer, number: u8) {
+    let written =
+        writer.write_cdr(Cdr::little(cdr(number).into()).unwrap(), WriteOptionsBuilder::new());
+    assert!(matches!(written, Written::Taken(_)), "{written:?}");
+}
+
+fn frame(topic: &str, writer: u8, number: u8) -> Frame {
+    let header = Header {
+        encoding: ENCODING.to_owned(),
+        ..Header::new(topic, Origin::default(), WriterId([writer; 16]), number.into(), 0)
+    };
+    Frame::new(&header, cdr(number).into()).unwrap()
+}
+
+fn number(received: &Received) -> u8 {
+    match &received.content {
+        Content::Frame(frame) => frame.payload()[4],
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Reads until a message with this number came.
+async fn until(subscription: &mut Subscription, last: u8) -> Vec<u8> {
+    let mut found = Vec::new();
+    let read = async {
+        while found.last().map(number) != Some(last) {
+            assert!(subscription.receive(&mut found, usize::MAX).await > 0);
+        }
+    };
+    let waited = tokio::time::timeout(DEADLINE, read).await;
+    let numbers = found.iter().map(number).collect();
+    assert!(waited.is_ok(), "{last} has not come: {numbers:?}");
+    numbers
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_the_flow_writes_leaves_room_for_samples_that_wait_for_an_owner() {
+    let net = Net::start().await;
+    let node = net.node();
+    let writer = node.typed_writer(("rt/a", TYPE), reliable(16)).unwrap();
+    let _reader = node.typed_reader(("rt/a", TYPE), reliable(64), Box::new(|_| true)).unwrap();
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    net.network("both", |network| network.endpoints.len() == 2).await;
+    let publisher = net.broker.publisher(&"a".parse().unwrap(), RELIABLE).unwrap();
+    eventually("matched", || writer.is_matched().then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    put(&writer, 1);
+    for _ in 0..3_000 {
+        publisher.publish(&frame("a", 7, 9), None);
+    }
+    eventually("written", || (publisher.later().queued == 0).then_some(())).await;
+    put(&writer, 2);
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    net.own(&[writer.id()]).await;
+    assert_eq!(until(&mut subscription, 2).await, [1, 2]);
+    assert_eq!(subscription.take_dropped(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_kept_is_read_beside_other_writers_of_the_topic() {
+    let net = Net::start().await;
+    let node = net.node();
+    let kept = node.typed_writer(("rt/map", TYPE), keeping(3)).unwrap();
+    (1..=3).for_each(|number| put(&kept, number));
+    net.own(&[kept.id()]).await;
+    let mut subscription = net.read("map", WITH_KEPT).await;
+    assert_eq!(until(&mut subscription, 3).await, [1, 2, 3]);
+    // Writers that keep nothing come later; they are read, too.
+    let reliable = node.typed_writer(("rt/map", TYPE), reliable(8)).unwrap();
+    let best_effort = node.typed_writer(("rt/map", TYPE), Profile::best_effort(8)).unwrap();
+    net.own(&[kept.id(), reliable.id(), best_effort.id()]).await;
+    for (writer, number) in [(&reliable, 4), (&best_effort, 5), (&kept, 6)] {
+        eventually("matched", || writer.is_matched().then_some(())).await;
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        put(writer, number);
+        assert_eq!(until(&mut subscription, number).await, [number]);
+    }
+    assert_eq!(subscription.take_dropped(), 0);
+}
+
+/// A reader on a node: all that came, by number.
+struct Reads {
+    found: Arc<Mutex<Vec<u8>>>,
+    _reader: Reader,
+}
+
+impl Reads {
+    fn start(node: &Participant, topic: &str, profile: Profile) -> Self {
+        let found = Arc::<Mutex<Vec<u8>>>::default();
+        let sink = Arc::clone(&found);
+        let reader = node.typed_reader(
+            (topic, TYPE),
+            profile,
+            Box::new(move |sample| {
+                sink.lock().push(sample.sample.body()[0]);
+                true
+            }),
+        );
+        Self { found, _reader: reader.unwrap() }
+    }
+
+    async fn until(&self, last: u8) -> Vec<u8> {
+        let found = || Some(self.found.lock().clone()).filter(|it| it.contains(&last));
+        eventually("read", found).await
+    }
+}
+
+fn with_terms(profile: Profile, deadline_s: Option<u64>, manual: bool) -> Profile {
+    let deadline = deadline_s.map(Duration::from_secs);
+    Profile { terms: Terms { deadline, manual, ..Terms::default() }, ..profile }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn each_message_comes_once_while_readers_with_other_demands_come_and_go() {
+    let net = Net::start().await;
+    // All readers of a participant share what it received.
+    let (node, guest) = (net.node(), net.node());
+    let steady = Reads::start(&node, "rt/a", reliable(256));
+    net.network("the reader", |network| network.endpoints.len() == 1).await;
+    let publisher = net.broker.publisher(&"a".parse().unwrap(), RELIABLE).unwrap();
+    let mut other = None;
+    for number in 1..=250 {
+        // Twice others come, and go after a while.
+        match number {
+            20 | 130 => {
+                let profile = with_terms(reliable(256), Some(10), number == 130);
+                other = Some(Reads::start(&guest, "rt/a", profile));
+            }
+            90 | 200 => drop(other.take()),
+            _ => {}
+        }
+        publisher.publish(&frame("a", 7, number), None);
+        let later = publisher.later();
+        assert_eq!(later.dropped(), 0);
+        tokio::time::sleep(Duration::from_millis(10)).await;
+        if number == 85 || number == 195 {
+            let other = other.as_ref().unwrap();
+            let last = *other.until(number).await.last().unwrap();
+            assert_eq!(last, number, "it is served");
+        }
+    }
+    assert_eq!(steady.until(250).await, (1..=250).collect::<Vec<u8>>());
+    eventually("all is written", || (publisher.later().queued == 0).then_some(())).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_was_published_for_late_joiners_survives_other_writers() {
+    let net = Net::start().await;
+    let (node, guest) = (net.node(), net.node());
+    let options = PublisherOptions { depth: 2, ..RELIABLE };
+    let publisher = net.broker.publisher(&"map".parse().unwrap(), options).unwrap();
+    let early = Reads::start(&node, "rt/map", keeping(16));
+    for (writer, number) in [(1, 1), (1, 2), (2, 3), (1, 4)] {
+        publisher.publish(&frame("map", writer, number), None);
+    }
+    let mut found = early.until(4).await;
+    found.sort_unstable();
+    assert!(found.ends_with(&[2, 3, 4]), "{found:?}");
+    let late = Reads::start(&guest, "rt/map", with_terms(keeping(16), Some(10), false));
+    eventually("what was kept", || {
+        let mut found = late.found.lock().clone();
+        found.sort_unstable();
+        (found == [2, 3, 4]).then_some(())
+    })
+    .await;
+    publisher.publish(&frame("map", 1, 5), None);
+    assert_eq!(late.until(5).await.len(), 4);
+    let news = early.until(5).await.iter().filter(|number| **number == 5).count();
+    assert_eq!(news, 1);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_reader_that_asks_for_more_than_is_published_is_served() {
+    let net = Net::start().await;
+    let (node, guest) = (net.node(), net.node());
+    let publisher =
+        net.broker.publisher(&"a".parse().unwrap(), PublisherOptions::default()).unwrap();
+    let readers = [
+        Reads::start(&node, "rt/a", keeping(16)),
+        Reads::start(&guest, "rt/a", with_terms(Profile::best_effort(16), None, true)),
+    ];
+    net.network("the readers", |network| network.endpoints.len() == 2).await;
+    let until = Instant::now() + DEADLINE;
+    while !readers.iter().all(|reads| reads.found.lock().contains(&1)) {
+        assert!(Instant::now() < until, "{:?}", readers.map(|it| it.found.lock().clone()));
+        publisher.publish(&frame("a", 1, 1), None);
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_message_of_a_writer_that_leaves_at_once_is_read() {
+    let net = Net::start().await;
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    let steady = net.node();
+    let other = steady.typed_writer(("rt/a", TYPE), reliable(8)).unwrap();
+    net.own(&[other.id()]).await;
+    eventually("matched", || other.is_matched().then_some(())).await;
+    let node = net.node();
+    let writer = node.typed_writer(("rt/a", TYPE), reliable(8)).unwrap();
+    let id = writer.id();
+    eventually("matched", || writer.is_matched().then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    put(&writer, 1);
+    eventually("acknowledged", || writer.is_acknowledged().then_some(())).await;
+    drop((writer, node));
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    net.own(&[other.id(), id]).await;
+    assert_eq!(until(&mut subscription, 1).await, [1]);
+    assert_eq!(subscription.take_dropped(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_nobody_decides_about_counts_as_lost() {
+    let net = Net::start().await;
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    let node = net.node();
+    let [owned, nobodys] =
+        [(); 2].map(|()| node.typed_writer(("rt/a", TYPE), reliable(8)).unwrap());
+    net.own(&[owned.id()]).await;
+    for writer in [&owned, &nobodys] {
+        eventually("matched", || writer.is_matched().then_some(())).await;
+    }
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    put(&nobodys, 1);
+    put(&nobodys, 2);
+    let dropped = || Some(subscription.take_dropped()).filter(|dropped| *dropped > 0);
+    assert_eq!(eventually("lost", dropped).await, 2);
+    put(&owned, 3);
+    assert_eq!(until(&mut subscription, 3).await, [3]);
+}

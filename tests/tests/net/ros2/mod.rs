@@ -1,0 +1,9 @@
+//! ROS 2: rclpy and Cyclone DDS beside flows.
+
+mod churn;
+mod direct;
+mod graph;
+mod long;
+mod quality;
+mod routes;
+mod support;
