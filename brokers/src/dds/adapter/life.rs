@@ -213,8 +213,9 @@ fn full(slots: &[Arc<Slot>], now: Instant) -> Vec<(&str, Instant)> {
 }
 
 /// Makes the writers and readers that are wanted and missing, until its time is over. Returns
-/// whether some may be left.
+/// whether it made some and others may be left.
 fn make_missing(shared: &Arc<Shared>, generation: &mut Generation, until: Instant) -> bool {
+    let before = generation.changes();
     let mut refused = None;
     let mut is_over = false;
     for slot in shared.slots.live() {
@@ -238,5 +239,5 @@ fn make_missing(shared: &Arc<Shared>, generation: &mut Generation, until: Instan
     if let Some(error) = refused {
         tracing::warn!(domain = shared.domain, %error, "RustDDS refuses");
     }
-    is_over
+    is_over && generation.changes() != before
 }

@@ -40,7 +40,7 @@ pub(super) struct Generation {
     farewell: Farewell,
     /// Those of topics.
     readers: BTreeSet<EndpointId>,
-    /// How often readers and writers came and went.
+    /// How often they and the writers came and went.
     changes: u64,
     pub(super) presence: Arc<Mutex<Presence>>,
     pub(super) participant: Participant,
@@ -84,6 +84,11 @@ impl Generation {
     /// Whether a participant came back that RustDDS cannot meet again in this life.
     pub(super) fn has_missed_one(&self) -> bool {
         self.watch.has_returned()
+    }
+
+    /// How often readers and writers of topics came and went.
+    pub(super) fn changes(&self) -> u64 {
+        self.changes
     }
 
     /// Makes a writer.
