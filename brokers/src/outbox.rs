@@ -708,4 +708,25 @@ mod tests {
         lane.push(bare(4, 10), None);
         assert!(rings(&outbox));
     }
+
+    #[test]
+    fn a_lane_can_wait_until_all_of_another_is_settled() {
+        let outbox = Outbox::new(SMALL);
+        let [new, old] = ["new", "old"].map(|to| outbox.lane(to, None));
+        for (lane, number) in [(&new, 3), (&old, 1), (&old, 2)] {
+            lane.push(bare(number, 1), None);
+        }
+        let backlog = old.backlog();
+        let take = || {
+            let mut into = Vec::new();
+            let allowance = |to: &&str| (*to == "old" || backlog.is_empty()).then_some(usize::MAX);
+            outbox.take_ready(Instant::now(), 9, 9_999, true, allowance, &mut into);
+            into
+        };
+        let first = take();
+        assert_eq!(first.iter().map(number).collect::<Vec<_>>(), [("old", 1), ("old", 2)]);
+        assert!(take().is_empty(), "they are taken, but not written");
+        first.into_iter().for_each(|waiting| waiting.settle(Fate::Delivered));
+        assert_eq!(take().iter().map(number).collect::<Vec<_>>(), [("new", 3)]);
+    }
 }

@@ -630,6 +630,11 @@ impl SubscriptionSender {
         self.ring.queue.lock().closed
     }
 
+    /// Whether both hand messages to the same reader.
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.ring, &other.ring)
+    }
+
     /// Ends the subscription; the reader still gets what waits.
     pub fn close(&self) {
         self.ring.queue.lock().closed = true;

@@ -41,6 +41,7 @@ use blaze_domain::node_file::MAX_DDS_DOMAIN;
 pub use fault::Fault;
 pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, Terms};
 pub use pulse::{Illness, Pulse};
+pub(crate) use reader::take_up_to;
 pub use reader::{OctetsSink, Reader, Sample, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
 pub use sample::{Cdr, octet_sequence};

@@ -7,6 +7,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use bytes::Bytes;
+use rustdds::dds::ReadResult;
 
 use super::participant::{RawReader, prefix_of};
 use super::sample::Cdr;
@@ -82,19 +83,30 @@ impl Reader {
 /// Takes what is there. Returns whether there was anything.
 fn drain(reader: &RawReader, sink: &SampleSink, malformed: &AtomicU64) -> bool {
     let mut any = false;
-    reader.drain_read_notifications();
-    loop {
-        let is_well_formed = match reader.try_take_one() {
-            Ok(Some(sample)) => sink(sample),
-            Ok(None) => return any,
-            // Its encoding is none of CDR.
-            Err(_) => false,
-        };
+    take_up_to(reader, usize::MAX, |taken| {
         any = true;
-        if !is_well_formed {
+        // The encoding of an error is none of CDR.
+        if !taken.is_ok_and(sink) {
             malformed.fetch_add(1, Ordering::Relaxed);
         }
+    });
+    any
+}
+
+/// Takes samples as long as there are any, at most `limit`. Returns whether there may be more.
+pub(crate) fn take_up_to(
+    reader: &RawReader,
+    limit: usize,
+    mut sink: impl FnMut(ReadResult<Sample>),
+) -> bool {
+    reader.drain_read_notifications();
+    for _ in 0..limit {
+        match reader.try_take_one().transpose() {
+            Some(taken) => sink(taken),
+            None => return false,
+        }
     }
+    true
 }
 
 /// A named thread that is asked to stop and waited for on drop. A panic in it sets `failed`.

@@ -16,12 +16,13 @@ use super::names::Carries;
 use super::network::Knowledge;
 use super::services::{Forwarded, OnWire, Services, carries};
 use crate::dds::adapter::{
-    Admission, Companion, Dialect, Encoded, NoMessage, Others, Topic, nanos,
+    Admission, Companion, Decoded, Dialect, Encoded, NoMessage, Others, Topic, nanos,
 };
 use crate::dds::participant::{RawReader, prefix_of};
+
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
-    Relay, Sample, Terms, Writer, Written, endpoint_of,
+    Relay, Sample, Terms, Writer, Written, endpoint_of, take_up_to,
 };
 use crate::outbox::Body;
 use crate::port::Content;
@@ -40,6 +41,7 @@ const PARTICIPANT: [u8; 4] = [0x00, 0x00, 0x01, 0xc1];
 /// The dialect of ROS 2.
 pub(super) struct Ros {
     pub(super) flow: FlowId,
+    pub(super) interface: Ipv4Addr,
     pub(super) gid: GidLength,
     pub(super) knowledge: Arc<Knowledge>,
     pub(super) services: Arc<Services>,
@@ -98,18 +100,14 @@ impl Dialect for Ros {
         }
     }
 
-    fn admission(&self, writer: &EndpointId) -> Admission {
-        self.knowledge.admission(writer)
+    fn admission(&self, topic: &Topic, writer: &EndpointId) -> Admission {
+        self.knowledge.admission(writer, &topic.type_name)
     }
 
-    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Content, NoMessage> {
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Decoded, NoMessage> {
         let id = sample.writer_guid.to_bytes();
-        let writer = self.knowledge.writer(&id).ok_or(NoMessage::NotForUs)?;
-        // RustDDS looks at names of topics alone.
-        if writer.dds_type != *topic.type_name {
-            return Err(NoMessage::NotForUs);
-        }
-        let type_name = writer.type_name.as_ref().ok_or(NoMessage::NotForUs)?;
+        let writer = self.knowledge.writer(&id).ok_or(NoMessage::Malformed)?;
+        let type_name = writer.type_name.as_ref().ok_or(NoMessage::Malformed)?;
         let sequence =
             u64::try_from(i64::from(sample.sequence_number)).map_err(|_| NoMessage::Malformed)?;
         let written = sample.source_timestamp().map_or(0, nanos);
@@ -131,7 +129,6 @@ impl Dialect for Ros {
             lifespan_ms: writer.lifespan_ms(),
             reliable: writer.reliable,
             depth: if writer.durable { KEPT_SAMPLES } else { 0 },
-            age_us: age_us(written, nanos(Timestamp::now()), &writer.addresses),
             ..Header::new(
                 &topic.user,
                 origin,
@@ -140,8 +137,10 @@ impl Dialect for Ros {
                 u64::try_from(written).unwrap_or(0),
             )
         };
-        let frame = Frame::new(&header, payload);
-        frame.map(Content::Frame).map_err(|_| NoMessage::Malformed)
+        let frame = Frame::new(&header, payload).map_err(|_| NoMessage::Malformed)?;
+        let written = Some(written).filter(|_| is_of_host(self.interface, &writer.addresses));
+        let age_us = age_us(written, nanos(sample.receive_instant), nanos(Timestamp::now()));
+        Ok(Decoded { content: Content::Frame(frame), age_us })
     }
 
     fn encode(&self, _: &Topic, message: &Body, _: bool) -> Result<Encoded, DropReason> {
@@ -232,13 +231,17 @@ impl Ros {
     }
 }
 
-/// Age of a sample that was written just now, as far as clocks tell: those of this host are one.
-fn age_us(written_ns: i128, now_ns: i128, addresses: &[Ipv4Addr]) -> u64 {
-    let is_of_this_host = addresses.iter().any(Ipv4Addr::is_loopback);
-    if !is_of_this_host || written_ns == 0 {
-        return 0;
-    }
-    u64::try_from((now_ns - written_ns).max(0) / 1_000).unwrap_or(u64::MAX)
+/// Whether a participant is on the host that has an interface, and so has its clock.
+fn is_of_host(interface: Ipv4Addr, addresses: &[Ipv4Addr]) -> bool {
+    let on_loopback = interface.is_loopback();
+    addresses.iter().any(|it| *it == interface || (on_loopback && it.is_loopback()))
+}
+
+/// Age of a sample: since it was received, and since it was written where a clock of this host says
+/// when.
+fn age_us(written_ns: Option<i128>, received_ns: i128, now_ns: i128) -> u64 {
+    let written_ns = written_ns.filter(|written| *written > 0).unwrap_or(received_ns);
+    u64::try_from((now_ns - written_ns.min(received_ns)).max(0) / 1_000).unwrap_or(u64::MAX)
 }
 
 /// A time of day as RTPS has it; `None` where it is not known.
@@ -256,16 +259,15 @@ struct Graph {
     node: String,
     knowledge: Arc<Knowledge>,
     user: Arc<OnceLock<Weak<Inner>>>,
-    told: Option<ParticipantNodes>,
+    /// How often endpoints had changed when they were told last.
+    told: Option<u64>,
 }
 
 impl Companion for Graph {
     fn tick(&mut self, now: Instant, own: GuidPrefix, others: &Others<'_>) -> bool {
         self.tell(own, others);
-        self.reader.drain_read_notifications();
-        for _ in 0..GRAPHS {
-            let Ok(taken) = self.reader.try_take_one() else { continue };
-            let Some(sample) = taken else { break };
+        take_up_to(&self.reader, GRAPHS.into(), |taken| {
+            let Ok(sample) = taken else { return others.note_malformed() };
             let from = prefix_of(sample.writer_guid);
             match ParticipantNodes::read(&sample.sample) {
                 Some(told) if from != own && told.participant[..12] == from.0 => {
@@ -274,7 +276,7 @@ impl Companion for Graph {
                 Some(_) => {}
                 None => others.note_malformed(),
             }
-        }
+        });
         self.knowledge.tick(now);
         if let Some(user) = self.user.get().and_then(Weak::upgrade) {
             user.tick(now);
@@ -286,6 +288,10 @@ impl Companion for Graph {
 impl Graph {
     /// Tells the own endpoints, if they are others than before.
     fn tell(&mut self, own: GuidPrefix, others: &Others<'_>) {
+        let changes = others.changes();
+        if self.told == Some(changes) {
+            return;
+        }
         let (mut readers, mut writers) = others.own_endpoints();
         // Other flows know it by these, also when it has nothing else there.
         readers.push(endpoint_of(self.reader.guid()));
@@ -297,12 +303,10 @@ impl Graph {
         participant[..12].copy_from_slice(&own.0);
         participant[12..].copy_from_slice(&PARTICIPANT);
         let nodes = ParticipantNodes { participant, nodes: vec![node] };
-        if self.told.as_ref() == Some(&nodes) {
-            return;
-        }
-        if let Some(cdr) = nodes.write(self.gid) {
-            self.writer.write_cdr(cdr, WriteOptionsBuilder::new());
-            self.told = Some(nodes);
+        let Some(cdr) = nodes.write(self.gid) else { return };
+        let written = self.writer.write_cdr(cdr, WriteOptionsBuilder::new());
+        if matches!(written, Written::Taken(_) | Written::NoReader) {
+            self.told = Some(changes);
         }
     }
 }
@@ -312,12 +316,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ages_are_told_by_the_clock_of_this_host_alone() {
-        let here = [Ipv4Addr::LOCALHOST];
-        assert_eq!(age_us(5_000_000, 9_000_000, &here), 4_000);
-        assert_eq!(age_us(9_000_000, 5_000_000, &here), 0, "a clock may be set back");
-        assert_eq!(age_us(0, 5_000_000, &here), 0, "not told");
-        assert_eq!(age_us(5_000_000, 9_000_000, &[Ipv4Addr::new(10, 0, 0, 1)]), 0);
+    fn ages_begin_with_writing_where_its_clock_is_ours_else_with_arrival() {
+        let ms = |written: Option<i128>, received: i128, now: i128| {
+            age_us(written.map(|ms| ms * 1_000_000), received * 1_000_000, now * 1_000_000) / 1_000
+        };
+        assert_eq!(ms(Some(5), 8, 9), 4);
+        assert_eq!(ms(None, 8, 9), 1, "it lay here");
+        assert_eq!(ms(Some(0), 8, 9), 1, "not told");
+        assert_eq!(ms(Some(20), 8, 9), 1, "a clock may be set back");
+        assert_eq!(ms(Some(20), 10, 9), 0);
+    }
+
+    #[test]
+    fn a_host_is_known_by_the_address_of_its_interface() {
+        let [mine, other] = [Ipv4Addr::new(10, 0, 0, 1), Ipv4Addr::new(10, 0, 0, 2)];
+        let local = Ipv4Addr::LOCALHOST;
+        assert!(is_of_host(mine, &[local, mine]));
+        assert!(!is_of_host(mine, &[local, other]), "each host has that one");
+        assert!(is_of_host(local, &[other, local]));
     }
 
     #[test]

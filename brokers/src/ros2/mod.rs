@@ -41,7 +41,7 @@ use crate::port::{
 use dialect::Ros;
 use names::{RosName, type_to_dds};
 use network::Knowledge;
-use offers::{Offer, Offered};
+use offers::{MAX_TYPES, Offer, Offered};
 use services::Services;
 use shown::AllShown;
 
@@ -101,6 +101,8 @@ struct Read {
     options: SubscribeOptions,
     /// DDS types that it is read in.
     types: BTreeSet<String>,
+    /// It has more types than are read.
+    has_too_many: bool,
 }
 
 impl Ros2Broker {
@@ -125,6 +127,7 @@ impl Ros2Broker {
         let user = Arc::<OnceLock<Weak<Inner>>>::default();
         let ros = Ros {
             flow: config.flow,
+            interface: config.interface,
             gid: config.gid,
             knowledge: Arc::clone(&knowledge),
             services: Arc::clone(&services),
@@ -230,7 +233,8 @@ impl Broker for Ros2Broker {
         if reads.len() >= MAX_TOPICS {
             return Err(BrokerError::TooManyChannels(MAX_TOPICS));
         }
-        let mut read = Read { topic, name, sender, options, types: BTreeSet::new() };
+        let mut read =
+            Read { topic, name, sender, options, types: BTreeSet::new(), has_too_many: false };
         read.follow(&self.inner);
         reads.push(read);
         Ok(subscription)
@@ -238,6 +242,7 @@ impl Broker for Ros2Broker {
 
     async fn close(&self) {
         self.inner.adapter.close().await;
+        self.inner.end_reads();
     }
 }
 
@@ -329,26 +334,55 @@ impl Inner {
         self.reads.lock().retain(|read| !read.sender.is_closed());
     }
 
+    /// Ends all subscriptions, also those that have no writers.
+    fn end_reads(&self) {
+        self.reads.lock().drain(..).for_each(|read| read.sender.close());
+    }
+
     fn offers_of(&self, name: &RosName) -> Vec<Arc<Offer>> {
         self.offers.lock().get(name).into_iter().flatten().filter_map(Weak::upgrade).collect()
     }
 }
 
+impl Drop for Inner {
+    fn drop(&mut self) {
+        self.end_reads();
+    }
+}
+
 impl Read {
-    /// Makes readers for types that writers have now.
+    /// Makes readers for types that writers have now, and ends those of types that none has.
     fn follow(&mut self, inner: &Inner) {
-        for writer in inner.knowledge.endpoints(&self.name, true) {
-            if !writer.is_readable() || self.types.contains(&writer.dds_type) {
+        let writers = inner.knowledge.endpoints(&self.name, true);
+        let is_used = |dds_type: &String| {
+            writers.iter().any(|writer| writer.dds_type == *dds_type)
+                || inner.knowledge.is_written(&self.name, dds_type)
+        };
+        for unused in self.types.extract_if(.., |dds_type| !is_used(dds_type)) {
+            let topic = dds_topic(&self.name, &self.topic, &unused, marked());
+            inner.adapter.stop_reading(&topic, &self.sender);
+        }
+        for writer in writers.iter().filter(|writer| writer.is_readable()) {
+            if self.types.contains(&writer.dds_type) {
                 continue;
             }
-            let terms = Terms { marked: true, ..Terms::default() };
-            let topic = dds_topic(&self.name, &self.topic, &writer.dds_type, terms);
+            if self.types.len() >= MAX_TYPES {
+                if !std::mem::replace(&mut self.has_too_many, true) {
+                    tracing::warn!(topic = %self.topic, limit = MAX_TYPES, "too many types");
+                }
+                return;
+            }
+            let topic = dds_topic(&self.name, &self.topic, &writer.dds_type, marked());
             match inner.adapter.read(topic, self.sender.clone(), self.options) {
                 Ok(()) => _ = self.types.insert(writer.dds_type.clone()),
                 Err(error) => tracing::warn!(topic = %self.topic, %error, "not read"),
             }
         }
     }
+}
+
+fn marked() -> Terms {
+    Terms { marked: true, ..Terms::default() }
 }
 
 fn dds_topic(name: &RosName, topic: &TopicName, dds_type: &str, terms: Terms) -> Topic {

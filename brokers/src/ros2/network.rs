@@ -159,15 +159,15 @@ impl Knowledge {
         }
     }
 
-    /// Whether a sample of a writer is to be taken.
-    pub(super) fn admission(&self, writer: &EndpointId) -> Admission {
+    /// Whether a sample of a writer is to be taken by those who read a type. RustDDS looks at names
+    /// of topics alone, and gives them what this flow writes, too.
+    pub(super) fn admission(&self, writer: &EndpointId, dds_type: &str) -> Admission {
         let state = self.state.lock();
         let is_own = state.own == Some(participant_of(writer));
-        // RustDDS gives what this flow writes to its readers, too.
+        let is_other = |it: &Entry| it.endpoint.dds_type != dds_type || !it.endpoint.is_readable();
+        let is_other = state.endpoints.get(writer).is_some_and(is_other);
         match state.owned.get(writer) {
-            _ if is_own || state.marked.contains(writer) || state.is_unreadable(writer) => {
-                Admission::No
-            }
+            _ if is_own || is_other || state.marked.contains(writer) => Admission::No,
             Some(true) => Admission::Yes,
             Some(false) => Admission::No,
             None => Admission::Later,
@@ -203,6 +203,12 @@ impl Knowledge {
             name.and_then(|name| state.by_name.get(&name)).is_some_and(|it| !it[0].is_empty())
         };
         requests.retain(is_client, is_served);
+    }
+
+    /// Whether a topic has a writer of a type, or had one whose samples may still wait.
+    pub(super) fn is_written(&self, name: &RosName, dds_type: &str) -> bool {
+        let of = |it: &RosEndpoint| it.is_writer && it.name == *name && it.dds_type == dds_type;
+        self.state.lock().endpoints.values().any(|entry| of(&entry.endpoint))
     }
 
     fn publish(&self, state: &mut State, now: Instant) {
@@ -270,7 +276,11 @@ impl State {
                 changed.insert(entry.endpoint.name.clone());
             }
             let waits = |at: Instant| now.saturating_duration_since(at) < LONGEST_DOUBT;
-            entry.gone.is_none_or(|at| entry.endpoint.is_writer && waits(at))
+            let stays = entry.gone.is_none_or(|at| entry.endpoint.is_writer && waits(at));
+            if !stays {
+                changed.insert(entry.endpoint.name.clone());
+            }
+            stays
         });
         let mut room = MAX_ENDPOINTS
             .saturating_sub(self.endpoints.values().filter(|entry| entry.gone.is_none()).count());
@@ -303,11 +313,6 @@ impl State {
             }
         }
         changed
-    }
-
-    /// Whether a writer has no type of ROS 2, so that nobody decides about it.
-    fn is_unreadable(&self, writer: &EndpointId) -> bool {
-        self.endpoints.get(writer).is_some_and(|entry| !entry.endpoint.is_readable())
     }
 }
 
@@ -360,16 +365,28 @@ mod tests {
         let all = [1, 2, 3].map(|number| found(number, "rt/a", TYPE));
         knowledge.note_endpoints(now, &writers(all.to_vec()));
         knowledge.set_owned([(all[0].id, true), (all[1].id, false)].into());
-        let admissions = all.each_ref().map(|it| knowledge.admission(&it.id));
+        let admissions = all.each_ref().map(|it| knowledge.admission(&it.id, TYPE));
         assert_eq!(admissions, [Admission::Yes, Admission::No, Admission::Later]);
-        assert_eq!(knowledge.admission(&[9; 16]), Admission::Later, "it may be found any moment");
+        assert_eq!(
+            knowledge.admission(&[9; 16], TYPE),
+            Admission::Later,
+            "it may be found any moment"
+        );
         knowledge.set_own(GuidPrefix([9; 12]));
-        assert_eq!(knowledge.admission(&[9; 16]), Admission::No, "its own");
+        assert_eq!(knowledge.admission(&[9; 16], TYPE), Admission::No, "its own");
         knowledge.note_endpoints(now, &writers(vec![all[2].clone()]));
-        assert_eq!(knowledge.admission(&all[0].id), Admission::Yes, "its samples may still come");
+        assert_eq!(
+            knowledge.admission(&all[0].id, TYPE),
+            Admission::Yes,
+            "its samples may still come"
+        );
         let later = now + LONGEST_DOUBT;
         knowledge.note_endpoints(later, &writers(vec![all[2].clone()]));
-        assert_eq!(knowledge.admission(&all[0].id), Admission::Later, "it is not known any more");
+        assert_eq!(
+            knowledge.admission(&all[0].id, TYPE),
+            Admission::Later,
+            "it is not known any more"
+        );
     }
 
     #[test]
@@ -382,11 +399,11 @@ mod tests {
         assert!(knowledge.endpoints(&RosName::of_dds("rt/a").unwrap(), true).is_empty());
         knowledge.tick(now + NODE_WAIT);
         assert_eq!(names(&knowledge).len(), 1, "the flow is to decide");
-        assert_eq!(knowledge.admission(&brief.id), Admission::Later);
+        assert_eq!(knowledge.admission(&brief.id, TYPE), Admission::Later);
         knowledge.set_owned([(brief.id, true)].into());
         assert!(names(&knowledge).is_empty());
         knowledge.set_owned(HashMap::new());
-        assert_eq!(knowledge.admission(&brief.id), Admission::Yes);
+        assert_eq!(knowledge.admission(&brief.id, TYPE), Admission::Yes);
         assert!(knowledge.writer(&brief.id).is_some());
         knowledge.note_endpoints(now + LONGEST_DOUBT, &writers(Vec::new()));
         assert!(knowledge.writer(&brief.id).is_none());
@@ -452,10 +469,16 @@ mod tests {
         let knowledge = Knowledge::new();
         let mut keyed = found(1, "rt/a", TYPE);
         keyed.id[15] = 0x02;
-        let other = found(2, "rt/a", "blaze::v1::Frame");
-        knowledge.note_endpoints(Instant::now(), &writers(vec![keyed.clone(), other.clone()]));
-        assert_eq!(knowledge.admission(&keyed.id), Admission::No);
-        assert_eq!(knowledge.admission(&other.id), Admission::No);
+        let odd = found(2, "rt/a", "blaze::v1::Frame");
+        let other = found(3, "rt/a", "std_msgs::msg::dds_::UInt8_");
+        knowledge.note_endpoints(
+            Instant::now(),
+            &writers(vec![keyed.clone(), odd.clone(), other.clone()]),
+        );
+        assert_eq!(knowledge.admission(&keyed.id, TYPE), Admission::No);
+        assert_eq!(knowledge.admission(&odd.id, &odd.type_name), Admission::No);
+        assert_eq!(knowledge.admission(&other.id, TYPE), Admission::No);
+        assert_eq!(knowledge.admission(&other.id, &other.type_name), Admission::Later);
     }
 
     #[test]

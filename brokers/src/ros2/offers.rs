@@ -49,9 +49,8 @@ impl Offered {
         published: PublisherOptions,
         readers: impl IntoIterator<Item = &'a RosEndpoint>,
     ) -> Self {
-        let terms = Terms { marked: true, ..Terms::default() };
         let PublisherOptions { reliable, depth, .. } = published;
-        let mut offered = Self { reliable, depth, terms };
+        let mut offered = Self { reliable, depth, terms: super::marked() };
         for reader in readers {
             offered.reliable |= reader.reliable;
             offered.depth = offered.depth.max(reader.durable.into());

@@ -18,7 +18,7 @@ use super::seen::Seen;
 use super::shared::{Shared, WriterFacts};
 use super::{Admission, Topic};
 use crate::dds::participant::RawReader;
-use crate::dds::reader::StoppableThread;
+use crate::dds::reader::{StoppableThread, take_up_to};
 use crate::dds::writer::endpoint_of;
 use crate::dds::{DdsError, EndpointId, Profile, Sample};
 use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
@@ -54,8 +54,6 @@ pub(super) struct Channel {
     pub(super) with_kept: bool,
     pub(super) senders: Mutex<Vec<SubscriptionSender>>,
     pub(super) readers: Mutex<Readers>,
-    /// Their identities, which others may ask for while they are read.
-    pub(super) ids: Mutex<[Option<EndpointId>; 3]>,
     /// Who waits until it is read.
     waiting: Mutex<Vec<oneshot::Sender<()>>>,
     /// It stands in the list of those with samples.
@@ -128,7 +126,12 @@ impl Channel {
         self.is_ready.store(false, Ordering::Release);
         let mut readers = self.readers.lock();
         let Readers { by_kind, opened, seen, history, doubtful } = &mut *readers;
-        let mut progress = Progress { opened: opened.unwrap_or(Timestamp::ZERO), seen, history };
+        // The last of them gets all samples of the topic.
+        let last =
+            Kind::ALL.into_iter().zip(&*by_kind).filter(|(_, reader)| reader.is_some()).last();
+        let counts = last.map(|(kind, _)| kind).filter(|_| shared.channels.is_first(self));
+        let opened = opened.unwrap_or(Timestamp::ZERO);
+        let mut progress = Progress { opened, counts, seen, history };
         self.resolve(shared, doubtful, &mut progress);
         let mut again = false;
         for (reader, kind) in by_kind.iter().zip(Kind::ALL) {
@@ -193,7 +196,7 @@ impl Channel {
         doubtful: &mut Doubtful<(Kind, Sample)>,
         progress: &mut Progress<'_>,
     ) {
-        let admission = |writer: &EndpointId| shared.dialect.admission(writer);
+        let admission = |writer: &EndpointId| shared.dialect.admission(&self.topic, writer);
         doubtful.resolve(Instant::now(), admission, |(kind, sample), outcome| match outcome {
             Outcome::Read => deliver(shared, self, kind, progress, &sample),
             Outcome::Lost => note_lost(shared, self, kind, progress, &sample),
@@ -210,7 +213,7 @@ impl Channel {
         doubtful: &mut Doubtful<(Kind, Sample)>,
     ) {
         let writer = endpoint_of(sample.writer_guid);
-        match shared.dialect.admission(&writer) {
+        match shared.dialect.admission(&self.topic, &writer) {
             Admission::Yes if !doubtful.has(&writer) => {
                 deliver(shared, self, kind, progress, &sample);
             }
@@ -220,7 +223,9 @@ impl Channel {
                     note_lost(shared, self, kind, progress, &lost);
                 }
             }
-            Admission::Yes | Admission::Later | Admission::No => {}
+            Admission::Yes | Admission::Later => {}
+            // What another flow takes meanwhile is not lost.
+            Admission::No => _ = progress.seen.remove(&writer),
         }
     }
 
@@ -233,18 +238,16 @@ impl Channel {
         progress: &mut Progress<'_>,
         doubtful: &mut Doubtful<(Kind, Sample)>,
     ) -> bool {
-        reader.drain_read_notifications();
-        for _ in 0..TURN {
-            match reader.try_take_one() {
-                Ok(Some(sample)) => self.take(shared, kind, sample, progress, doubtful),
-                Ok(None) => return false,
-                Err(error) => {
+        take_up_to(reader, TURN, |taken| match taken {
+            Ok(sample) => self.take(shared, kind, sample, progress, doubtful),
+            Err(error) => {
+                // All readers of a topic get it.
+                if progress.counts == Some(kind) {
                     shared.counts.lock().malformed += 1;
                     tracing::debug!(topic = &*self.topic.name, %error, "a sample cannot be read");
                 }
             }
-        }
-        true
+        })
     }
 }
 
@@ -314,7 +317,6 @@ impl Channels {
                     history: History::default(),
                     doubtful: Doubtful::new(Arc::clone(&self.doubtful)),
                 }),
-                ids: Mutex::default(),
                 waiting: Mutex::default(),
                 is_ready: AtomicBool::new(false),
                 ready,
@@ -340,19 +342,34 @@ impl Channels {
         self.all.lock().values().map(Arc::clone).collect()
     }
 
-    /// The identities of all readers.
-    pub(super) fn reader_ids(&self) -> Vec<EndpointId> {
-        let ids = |channel: Arc<Channel>| *channel.ids.lock();
-        let mut ids: Vec<EndpointId> = self.list().into_iter().flat_map(ids).flatten().collect();
-        ids.sort_unstable();
-        ids
-    }
-
     /// All channels are looked at, though nothing came.
     pub(super) fn look_again(&self) {
         for channel in self.list() {
             channel.note_samples();
         }
+    }
+
+    /// A subscription does not read a topic any more.
+    pub(super) fn remove(&self, topic: &Topic, sender: &SubscriptionSender) {
+        let by_topic = self.by_topic.read();
+        for channel in by_topic.get(&topic.name).into_iter().flatten() {
+            if channel.topic == *topic {
+                channel.senders.lock().retain(|other| !other.is_same(sender));
+            }
+        }
+    }
+
+    /// Whether a channel of a topic begins with what is kept.
+    pub(super) fn ask_for_kept(&self, topic: &str) -> bool {
+        let by_topic = self.by_topic.read();
+        by_topic.get(topic).into_iter().flatten().any(|channel| channel.with_kept)
+    }
+
+    /// Whether a channel is the first one of its topic.
+    fn is_first(&self, channel: &Channel) -> bool {
+        let by_topic = self.by_topic.read();
+        let first = by_topic.get(&channel.topic.name).and_then(|channels| channels.first());
+        first.is_some_and(|first| std::ptr::eq(&raw const **first, channel))
     }
 
     /// Takes out the channels that nobody reads any more.
@@ -390,7 +407,6 @@ impl Channels {
     /// Takes out all readers, whose participant has died.
     pub(super) fn take_readers(&self) -> Vec<RawReader> {
         let take = |channel: Arc<Channel>| {
-            *channel.ids.lock() = [None; 3];
             let mut readers = channel.readers.lock();
             readers.opened = None;
             std::mem::take(&mut readers.by_kind)

@@ -5,11 +5,11 @@ use std::time::Instant;
 
 use rustdds::Timestamp;
 
-use super::NoMessage;
 use super::channel::Channel;
 use super::kept::History;
 use super::seen::{Moment, Seen};
 use super::shared::{Shared, WriterFacts};
+use super::{Decoded, NoMessage};
 use crate::dds::EndpointId;
 use crate::dds::Sample;
 use crate::dds::writer::endpoint_of;
@@ -43,6 +43,8 @@ impl Kind {
 /// How far the readers of a channel have come.
 pub(super) struct Progress<'a> {
     pub(super) opened: Timestamp,
+    /// Which of them counts samples that cannot be read, so that each counts once.
+    pub(super) counts: Option<Kind>,
     pub(super) seen: &'a mut HashMap<EndpointId, Seen>,
     pub(super) history: &'a mut History,
 }
@@ -106,7 +108,11 @@ pub(super) fn deliver(
     };
     let own = facts.is_some_and(|facts| facts.own);
     let moment = moment_of(shared, facts, writer, sample);
-    let is_old = moment.is_some_and(|moment| moment.is_old(nanos(opened), own, seen));
+    let is_old = moment.is_some_and(|moment| {
+        // Without a reader that asks for what is kept, RustDDS gives none of it.
+        let may_be_kept = channel.with_kept || shared.channels.ask_for_kept(&channel.topic.name);
+        may_be_kept && moment.is_old(nanos(opened), own, seen)
+    });
     if missing > 0 && !own && !is_old && facts.is_some_and(|facts| facts.reliable) {
         // RustDDS acknowledges what it takes in, and drops the oldest that were not read in time.
         channel.note_lost(missing);
@@ -118,8 +124,8 @@ pub(super) fn deliver(
     } else if own || is_old || !since_opened {
         return;
     }
-    let content = match shared.dialect.decode(&channel.topic, sample) {
-        Ok(content) => content,
+    let Decoded { content, age_us } = match shared.dialect.decode(&channel.topic, sample) {
+        Ok(decoded) => decoded,
         Err(NoMessage::NotForUs) => return,
         Err(NoMessage::Malformed) => {
             shared.counts.lock().malformed += 1;
@@ -128,7 +134,7 @@ pub(super) fn deliver(
         }
     };
     let at = Instant::now();
-    let mut received = Received::live(content, at);
+    let mut received = Received { broker_age_us: age_us, ..Received::live(content, at) };
     match moment {
         Some(moment) if is_old => {
             received.kept = true;

@@ -35,7 +35,7 @@ impl Held {
         let least_ns = self.frames.iter().map(|(_, moment)| moment.lag_ns()).min();
         let behind_ns = behind_ns.or(least_ns).unwrap_or(0);
         self.frames.into_iter().map(move |(mut received, moment)| {
-            received.broker_age_us = moment.age_us(behind_ns);
+            received.broker_age_us = received.broker_age_us.max(moment.age_us(behind_ns));
             received
         })
     }
@@ -61,8 +61,8 @@ impl History {
         moment: Moment,
     ) -> Option<Received> {
         if self.writers.len() >= MAX_WRITERS && !self.writers.contains_key(&writer) {
-            received.broker_age_us =
-                moment.age_us(moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
+            let behind_ns = moment.clock.behind_ns().unwrap_or(moment.lag_ns());
+            received.broker_age_us = received.broker_age_us.max(moment.age_us(behind_ns));
             return Some(received);
         }
         let depth = match &received.content {
@@ -204,6 +204,17 @@ mod tests {
         assert_eq!(ages_ms(&history.quiet(now + QUIET, |_| sign)), [8_000, 5_000]);
         hold(&mut history, Clock::Awaited);
         assert_eq!(ages_ms(&history.quiet(now + LONGEST, |_| Clock::Awaited)), [3_000, 0]);
+    }
+
+    #[test]
+    fn an_age_that_is_known_does_not_count_twice() {
+        let now = Instant::now();
+        let mut history = History::default();
+        for (sequence, known_ms) in [(1, 2_000), (2, 9_000)] {
+            let known = Received { broker_age_us: known_ms * 1_000, ..received(now, sequence, 2) };
+            assert!(history.hold(now, [1; 16], known, moment(1_000, 6_000, KNOWN)).is_none());
+        }
+        assert_eq!(ages_ms(&history.quiet(now + QUIET, |_| KNOWN)), [5_000, 9_000]);
     }
 
     #[test]

@@ -24,6 +24,8 @@ const GOOD_BYE: Duration = Duration::from_secs(1);
 const INTERFACE: Duration = Duration::from_secs(1);
 /// After standing still for so long this participant may have been forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(20);
+/// How long writers and readers are made before the others have their turn.
+const MAKING: Duration = Duration::from_millis(100);
 /// A window that is full for a moment is the network's pace.
 const PRESSURE: Duration = Duration::from_millis(50);
 
@@ -44,6 +46,7 @@ struct Lifecycle {
     built: Instant,
     had_life: bool,
     next_look: Instant,
+    /// When the last tick ended.
     last_tick: Instant,
 }
 
@@ -64,10 +67,15 @@ impl Lifecycle {
     fn run(mut self, stop: &AtomicBool) {
         while !stop.load(Ordering::Relaxed) && !self.shared.stop.load(Ordering::Acquire) {
             // A panic of RustDDS in this thread is one more way of its death.
-            if catch_unwind(AssertUnwindSafe(|| self.tick())).is_err() {
+            let is_behind = catch_unwind(AssertUnwindSafe(|| self.tick())).unwrap_or_else(|_| {
                 self.bury("RustDDS panicked in a call");
+                false
+            });
+            // What took long itself is no pause.
+            self.last_tick = Instant::now();
+            if !is_behind {
+                thread::park_timeout(TICK);
             }
-            thread::park_timeout(TICK);
         }
         // Others are told of the end, unless RustDDS hangs.
         if let Some(done) = self.lay_aside() {
@@ -75,10 +83,10 @@ impl Lifecycle {
         }
     }
 
-    fn tick(&mut self) {
+    /// Returns whether there is more to do at once.
+    fn tick(&mut self) -> bool {
         let now = Instant::now();
         let paused = now.saturating_duration_since(self.last_tick);
-        self.last_tick = now;
         #[cfg(feature = "fault-injection")]
         if let Some(fault) = self.shared.fault.lock().take()
             && let Some(generation) = &self.generation
@@ -91,7 +99,7 @@ impl Lifecycle {
         if self.generation.is_none() && now >= self.next_attempt {
             self.give_birth(now);
         }
-        let Some(generation) = &mut self.generation else { return };
+        let Some(generation) = &mut self.generation else { return false };
         if paused > SILENT / 2 {
             generation.presence.lock().excuse(now);
         }
@@ -108,23 +116,24 @@ impl Lifecycle {
         };
         if let Some(reason) = reason {
             self.bury(reason);
-            return;
+            return false;
         }
-        if let Err(error) = make_missing(&self.shared, generation, now) {
-            tracing::warn!(domain = self.shared.domain, %error, "RustDDS refuses");
-        }
+        let is_behind = make_missing(&self.shared, generation, now + MAKING);
         let slots = self.shared.slots.live();
         generation.expel(&self.shared, now, &full(&slots, now));
         for writer in self.shared.slots.take_gone(now) {
-            self.shared.writers.write().remove(&writer.id());
+            generation.forget_writer(&self.shared, writer.id());
         }
-        drop(self.shared.channels.take_unused());
+        for channel in self.shared.channels.take_unused() {
+            generation.forget_channel(&channel);
+        }
         let others = generation.presence.lock().count();
         let detail = format!(
             "DDS domain {} on {}, {others} other participants with readers",
             self.shared.domain, self.shared.address
         );
         self.shared.set_status(Health::Up, &detail);
+        is_behind
     }
 
     /// Why the participant must be replaced, if so.
@@ -203,19 +212,32 @@ fn full(slots: &[Arc<Slot>], now: Instant) -> Vec<(&str, Instant)> {
     full.collect()
 }
 
-/// Makes the writers and readers that are wanted and missing.
-fn make_missing(
-    shared: &Arc<Shared>,
-    generation: &Generation,
-    now: Instant,
-) -> Result<(), DdsError> {
-    let slots = shared.slots.live();
-    for slot in slots.iter().filter(|slot| slot.needs_writer()) {
-        generation.fill(shared, slot, now)?;
+/// Makes the writers and readers that are wanted and missing, until its time is over. Returns
+/// whether it made some and others may be left.
+fn make_missing(shared: &Arc<Shared>, generation: &mut Generation, until: Instant) -> bool {
+    let before = generation.changes();
+    let mut refused = None;
+    let mut is_over = false;
+    for slot in shared.slots.live() {
+        is_over = Instant::now() >= until;
+        if is_over {
+            break;
+        }
+        if slot.needs_writer() {
+            refused = generation.fill(shared, &slot).err().or(refused);
+        }
     }
     for channel in shared.channels.list() {
+        is_over = is_over || Instant::now() >= until;
+        if is_over {
+            break;
+        }
         let offered = shared.offered.read().get(&*channel.topic.name).copied().unwrap_or_default();
-        generation.open(&channel, channel.wanted(offered))?;
+        refused = generation.open(&channel, channel.wanted(offered)).err().or(refused);
     }
-    Ok(())
+    // The next may be made all the same.
+    if let Some(error) = refused {
+        tracing::warn!(domain = shared.domain, %error, "RustDDS refuses");
+    }
+    is_over && generation.changes() != before
 }

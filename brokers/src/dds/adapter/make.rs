@@ -1,6 +1,6 @@
 //! One life of the participant, and the writers and readers that are made on it.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -38,6 +38,10 @@ pub(super) struct Generation {
     probes: HashMap<GuidPrefix, (SocketAddr, Probe)>,
     next_probe: Instant,
     farewell: Farewell,
+    /// Those of topics.
+    readers: BTreeSet<EndpointId>,
+    /// How often they and the writers came and went.
+    changes: u64,
     pub(super) presence: Arc<Mutex<Presence>>,
     pub(super) participant: Participant,
 }
@@ -65,6 +69,8 @@ impl Generation {
             probes: HashMap::new(),
             next_probe: now,
             farewell,
+            readers: BTreeSet::new(),
+            changes: 0,
             presence,
             participant,
         })
@@ -80,11 +86,17 @@ impl Generation {
         self.watch.has_returned()
     }
 
+    /// How often readers and writers of topics came and went.
+    pub(super) fn changes(&self) -> u64 {
+        self.changes
+    }
+
     /// Makes a writer.
-    pub(super) fn fill(&self, shared: &Shared, slot: &Slot, now: Instant) -> Result<(), DdsError> {
+    pub(super) fn fill(&mut self, shared: &Shared, slot: &Slot) -> Result<(), DdsError> {
         let profile = slot.key.profile();
         let topic = &slot.key.topic;
         let writer = self.participant.typed_writer((&topic.name, &topic.type_name), profile)?;
+        let now = Instant::now();
         let facts = WriterFacts {
             reliable: profile.reliable,
             durable: profile.transient_local,
@@ -93,40 +105,60 @@ impl Generation {
             found: now,
         };
         shared.writers.write().insert(writer.id(), facts);
+        self.changes += 1;
         slot.put(writer, now);
         Ok(())
     }
 
-    /// Makes the readers of a channel that are missing.
-    pub(super) fn open(&self, channel: &Channel, wanted: [bool; 3]) -> Result<(), DdsError> {
+    /// A writer has gone.
+    pub(super) fn forget_writer(&mut self, shared: &Shared, writer: EndpointId) {
+        shared.writers.write().remove(&writer);
+        self.changes += 1;
+    }
+
+    /// Makes the readers of a channel that are missing, as far as RustDDS makes them.
+    pub(super) fn open(&mut self, channel: &Channel, wanted: [bool; 3]) -> Result<(), DdsError> {
         let topic = (&*channel.topic.name, &*channel.topic.type_name);
         let mut readers = channel.readers.lock();
         let Readers { by_kind, opened, .. } = &mut *readers;
-        let mut is_new = false;
+        let mut result = Ok(());
+        let before = self.changes;
         for ((reader, kind), wanted) in by_kind.iter_mut().zip(Kind::ALL).zip(wanted) {
-            if wanted && reader.is_none() {
-                is_new = true;
-                // What is taken from now on is new, however long making the reader takes.
-                let begin = Timestamp::now();
-                *reader = Some(self.participant.raw_reader(topic, channel.profile(kind))?);
-                opened.get_or_insert(begin);
+            if !wanted || reader.is_some() {
+                continue;
+            }
+            // What is taken from now on is new, however long making the reader takes.
+            let begin = Timestamp::now();
+            match self.participant.raw_reader(topic, channel.profile(kind)) {
+                Ok(made) => {
+                    self.readers.insert(endpoint_of(made.guid()));
+                    self.changes += 1;
+                    *reader = Some(made);
+                    opened.get_or_insert(begin);
+                }
+                Err(error) => result = Err(error),
             }
         }
-        if !is_new {
-            return Ok(());
-        }
-        *channel.ids.lock() = by_kind
-            .each_ref()
-            .map(|reader| reader.as_ref().map(|reader| endpoint_of(reader.guid())));
         drop(readers);
-        channel.opened();
-        Ok(())
+        if self.changes != before {
+            channel.opened();
+        }
+        result
+    }
+
+    /// A channel has gone.
+    pub(super) fn forget_channel(&mut self, channel: &Channel) {
+        for reader in channel.readers.lock().by_kind.iter().flatten() {
+            self.readers.remove(&endpoint_of(reader.guid()));
+            self.changes += 1;
+        }
     }
 
     /// What belongs to this life has its turn. Returns whether another participant has given this
     /// one up.
     pub(super) fn tick(&mut self, shared: &Shared, now: Instant) -> bool {
-        let others = Others { presence: &self.presence, shared };
+        let Self { presence, readers, changes, .. } = self;
+        let others = Others { presence, shared, readers, changes: *changes };
         self.companion.tick(now, self.participant.prefix(), &others)
     }
 
@@ -216,6 +248,8 @@ fn note_endpoints(shared: &Shared, presence: &Mutex<Presence>, endpoints: &Endpo
 pub(crate) struct Others<'a> {
     presence: &'a Mutex<Presence>,
     shared: &'a Shared,
+    readers: &'a BTreeSet<EndpointId>,
+    changes: u64,
 }
 
 impl Others<'_> {
@@ -235,7 +269,12 @@ impl Others<'_> {
         let own = writers.iter().filter(|(_, facts)| facts.own);
         let mut writers: Vec<EndpointId> = own.map(|(id, _)| *id).collect();
         writers.sort_unstable();
-        (self.shared.channels.reader_ids(), writers)
+        (self.readers.iter().copied().collect(), writers)
+    }
+
+    /// How often they came and went.
+    pub(crate) fn changes(&self) -> u64 {
+        self.changes
     }
 
     /// A sample was malformed.

@@ -95,11 +95,18 @@ pub(crate) enum Admission {
     Later,
 }
 
-/// Why a sample is no message to those who read its topic.
+/// A message that a sample holds.
+pub(crate) struct Decoded {
+    pub(crate) content: Content,
+    /// How long it was on its way at least, where the sample tells.
+    pub(crate) age_us: u64,
+}
+
+/// Why a sample is no message.
 pub(crate) enum NoMessage {
-    /// It is for other readers.
-    NotForUs,
     Malformed,
+    /// It is for readers of other participants.
+    NotForUs,
 }
 
 /// What one adapter does differently from others.
@@ -125,16 +132,16 @@ pub(crate) trait Dialect: Send + Sync + 'static {
     /// All readers and writers that others have.
     fn note_endpoints(&self, endpoints: &Endpoints);
 
-    /// Whether samples of a writer are read. It may not have been found yet.
-    fn admission(&self, _writer: &EndpointId) -> Admission {
+    /// Whether samples of a writer are read as a topic's. It may not have been found yet.
+    fn admission(&self, _topic: &Topic, _writer: &EndpointId) -> Admission {
         Admission::Yes
     }
 
     /// What a sample of another participant holds, or what an own writer keeps.
     ///
     /// # Errors
-    /// [`NoMessage`] where it is none.
-    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Content, NoMessage>;
+    /// Why it is no message.
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Decoded, NoMessage>;
 
     /// The sample of a message. `durable`: it is kept for late joiners.
     ///
@@ -284,6 +291,11 @@ impl Adapter {
         self.shared.channels.add(topic, sender, options)?;
         self.shared.wake_lifecycle();
         Ok(())
+    }
+
+    /// Ends what [`read`](Self::read) began.
+    pub(crate) fn stop_reading(&self, topic: &Topic, sender: &SubscriptionSender) {
+        self.shared.channels.remove(topic, sender);
     }
 
     /// Reads a topic.

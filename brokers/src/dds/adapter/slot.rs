@@ -150,7 +150,7 @@ impl Slot {
         let state = self.state.lock();
         let (Some(writer), Some(made)) = (&state.writer, state.made) else { return false };
         let age = now.saturating_duration_since(made);
-        age >= limit || (age >= STANDS && writer.has_met(readers))
+        may_take_over(age, limit, || writer.has_met(readers))
     }
 
     /// Since when its window has been full.
@@ -230,9 +230,23 @@ fn may_go(passed: Duration, is_acknowledged: impl FnOnce() -> bool) -> bool {
     passed >= LONGEST_LINGER || (passed >= LINGER && is_acknowledged())
 }
 
+/// Whether a writer of this age may take over from another.
+fn may_take_over(age: Duration, limit: Duration, has_met: impl FnOnce() -> bool) -> bool {
+    age >= limit || (age >= STANDS && has_met())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_writer_takes_over_when_readers_have_found_it_or_after_a_while() {
+        let limit = Duration::from_secs(2);
+        assert!(!may_take_over(Duration::from_millis(99), limit, || true));
+        assert!(may_take_over(STANDS, limit, || true));
+        assert!(!may_take_over(Duration::from_millis(1_999), limit, || false));
+        assert!(may_take_over(limit, limit, || false));
+    }
 
     #[test]
     fn a_writer_waits_for_readers_but_not_for_ever() {

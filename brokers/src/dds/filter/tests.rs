@@ -67,7 +67,8 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
 }
 
 const LARGEST: u32 = 60 * 1024 + 8;
-const SAMPLES: Samples = Samples { largest: LARGEST, repaired: false, any_vendor: false, repeated: false };
+const SAMPLES: Samples =
+    Samples { largest: LARGEST, repaired: false, any_vendor: false, repeated: false };
 const ANY_VENDOR: Samples = Samples { any_vendor: true, ..SAMPLES };
 
 fn passes_shape(shape: Shape, samples: Samples, datagram: &[u8]) -> bool {
@@ -436,7 +437,8 @@ fn the_kernel_takes_the_filters_and_drops_what_it_must() {
 
 #[test]
 fn fragments_of_large_samples_are_asked_for_where_they_are_repaired() {
-    let samples = |repaired| Samples { largest: 16 << 20, repaired, any_vendor: false, repeated: false };
+    let samples =
+        |repaired| Samples { largest: 16 << 20, repaired, any_vendor: false, repeated: false };
     for e in BOTH {
         for (fragment, passes) in [(1, true), (1023, true), (1024, false), (65_535, false)] {
             let packet = message(&[e.nack_frag(1, fragment, 1)]);

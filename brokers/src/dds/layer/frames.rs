@@ -8,7 +8,7 @@ use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use super::names::{ALIVE, USER_PREFIX};
 use super::signs::Signs;
-use crate::dds::adapter::{Companion, Dialect, Encoded, NoMessage, Topic};
+use crate::dds::adapter::{Companion, Decoded, Dialect, Encoded, NoMessage, Topic};
 use crate::dds::{DdsError, Endpoints, Participant, ParticipantConfig, Sample, octet_sequence};
 use crate::outbox::Body;
 use crate::port::Content;
@@ -49,9 +49,9 @@ impl Dialect for Frames {
 
     fn note_endpoints(&self, _: &Endpoints) {}
 
-    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Content, NoMessage> {
+    fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Decoded, NoMessage> {
         let octets = sample.sample.octets().ok_or(NoMessage::Malformed)?;
-        Ok(Content::of(is_reserved(topic), octets))
+        Ok(Decoded { content: Content::of(is_reserved(topic), octets), age_us: 0 })
     }
 
     fn encode(&self, _: &Topic, message: &Body, durable: bool) -> Result<Encoded, DropReason> {

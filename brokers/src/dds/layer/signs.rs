@@ -9,7 +9,8 @@ use serde_json::{Value, json};
 use super::names::ALIVE;
 use crate::dds::adapter::{Companion, Others, nanos};
 use crate::dds::participant::{RawReader, prefix_of};
-use crate::dds::{DdsError, FRAME_TYPE, GuidPrefix, Participant, Profile, Writer};
+
+use crate::dds::{DdsError, FRAME_TYPE, GuidPrefix, Participant, Profile, Writer, take_up_to};
 
 /// Between two signs of life.
 const SIGN: Duration = Duration::from_millis(500);
@@ -43,15 +44,13 @@ impl Companion for Signs {
             self.writer.write(sign.to_string().as_bytes());
         }
         let mut given_up = false;
-        self.reader.drain_read_notifications();
-        for _ in 0..SIGNS {
-            let Ok(taken) = self.reader.try_take_one() else { continue };
-            let Some(sample) = taken else { break };
+        take_up_to(&self.reader, SIGNS.into(), |taken| {
+            let Ok(sample) = taken else { return };
             let from = prefix_of(sample.writer_guid());
             let octets = sample.sample.octets().unwrap_or_default();
-            let Ok(sign) = serde_json::from_slice::<Value>(&octets) else { continue };
+            let Ok(sign) = serde_json::from_slice::<Value>(&octets) else { return };
             if from == own {
-                continue;
+                return;
             }
             others.note_sign(now, from);
             if let Some(sent) = sign["time_ns"].as_u64() {
@@ -60,7 +59,7 @@ impl Companion for Signs {
             let name = own.to_string();
             let mut gone = sign["gone"].as_array().into_iter().flatten();
             given_up |= gone.any(|prefix| prefix.as_str() == Some(&name));
-        }
+        });
         given_up
     }
 }

@@ -15,7 +15,7 @@ use blaze_domain::{Origin, WriterId};
 use blaze_proto::{Frame, Header};
 use blaze_tests::flow::free_domain;
 use parking_lot::Mutex;
-use rustdds::WriteOptionsBuilder;
+use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use super::support::{DEADLINE, WITH_KEPT, eventually, wait_for};
 
@@ -312,4 +312,103 @@ async fn what_nobody_decides_about_counts_as_lost() {
     assert_eq!(eventually("lost", dropped).await, 2);
     put(&owned, 3);
     assert_eq!(until(&mut subscription, 3).await, [3]);
+}
+
+/// Writes with a time of writing that lies so many seconds ahead, or behind.
+fn put_at(writer: &Writer, number: u8, seconds_ahead: i32) {
+    let ahead = rustdds::Duration::from_secs(seconds_ahead.abs());
+    let now = Timestamp::now();
+    let written = if seconds_ahead < 0 { now - ahead } else { now + ahead };
+    let options = WriteOptionsBuilder::new().source_timestamp(written);
+    let written = writer.write_cdr(Cdr::little(cdr(number).into()).unwrap(), options);
+    assert!(matches!(written, Written::Taken(_)), "{written:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_writer_whose_clock_is_ahead_is_read_from_its_first_message() {
+    let net = Net::start().await;
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    let node = net.node();
+    let writer = node.typed_writer(("rt/a", TYPE), keeping(8)).unwrap();
+    net.own(&[writer.id()]).await;
+    eventually("matched", || writer.is_matched().then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    for number in 1..=3 {
+        put_at(&writer, number, 3_600);
+    }
+    assert_eq!(until(&mut subscription, 3).await, [1, 2, 3]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_age_of_what_is_kept_counts_once() {
+    let net = Net::start().await;
+    let node = net.node();
+    let writer = node.typed_writer(("rt/a", TYPE), keeping(8)).unwrap();
+    put_at(&writer, 1, -100);
+    put_at(&writer, 2, -50);
+    net.own(&[writer.id()]).await;
+    let mut subscription = net.read("a", WITH_KEPT).await;
+    let mut found = Vec::new();
+    while found.len() < 2 {
+        assert!(subscription.receive(&mut found, usize::MAX).await > 0);
+    }
+    let age_s = |received: &Received| match &received.content {
+        Content::Frame(frame) => (frame.age_us() + received.broker_age_us) / 1_000_000,
+        other => panic!("{other:?}"),
+    };
+    let ages: Vec<u64> = found.iter().map(age_s).collect();
+    assert!((100..110).contains(&ages[0]) && (50..60).contains(&ages[1]), "{ages:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn types_of_one_topic_are_read_apart_and_no_gap_of_one_counts_for_another() {
+    let net = Net::start().await;
+    let node = net.node();
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    let types = [TYPE, "std_msgs::msg::dds_::Int8_"];
+    let writers = types.map(|it| node.typed_writer(("rt/a", it), reliable(8)).unwrap());
+    net.own(&writers.each_ref().map(Writer::id)).await;
+    for writer in &writers {
+        eventually("matched", || writer.is_matched().then_some(())).await;
+    }
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    for (round, number) in [(0, 1), (1, 2), (0, 3)] {
+        put(&writers[round], number);
+        assert_eq!(until(&mut subscription, number).await, [number]);
+    }
+    // Another flow takes what comes next, and gives it back.
+    let [first, second] = writers.each_ref().map(Writer::id);
+    net.broker.set_owned([(first, false), (second, true)].into());
+    (10..20).for_each(|number| put(&writers[0], number));
+    eventually("acknowledged", || writers[0].is_acknowledged().then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    net.broker.set_owned([(first, true), (second, true)].into());
+    put(&writers[0], 20);
+    assert_eq!(until(&mut subscription, 20).await, [20]);
+    assert_eq!(subscription.take_dropped(), 0);
+    drop(writers);
+    net.network("no writers", |network| network.endpoints.is_empty()).await;
+    // Readers of a type end some seconds after its last writer, and begin again with the next.
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    let writer = node.typed_writer(("rt/a", TYPE), reliable(8)).unwrap();
+    net.own(&[writer.id()]).await;
+    eventually("matched", || writer.is_matched().then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    put(&writer, 30);
+    assert_eq!(until(&mut subscription, 30).await, [30]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_subscription_without_writers_ends_with_the_broker() {
+    let net = Net::start().await;
+    let [mut closed, mut dropped] = [net.read("a", SubscribeOptions::default()).await, {
+        let other = Net::start().await;
+        other.read("a", SubscribeOptions::default()).await
+    }];
+    net.broker.close().await;
+    for subscription in [&mut closed, &mut dropped] {
+        let mut none = Vec::new();
+        let end = subscription.receive(&mut none, usize::MAX);
+        assert_eq!(tokio::time::timeout(DEADLINE, end).await, Ok(0));
+    }
 }
