@@ -15,6 +15,8 @@
 //! repeated as Fast DDS takes it: for the reader of announcements, not for any reader.
 
 mod message;
+#[cfg(test)]
+mod tests;
 
 use std::collections::HashMap;
 use std::io::{self, ErrorKind};

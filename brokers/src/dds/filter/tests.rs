@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, UdpSocket};
 use std::time::Duration;
 
 use super::assembler::{Instruction, JUMP, Op, Test};
-use super::program::{Samples, Shape, program};
+use super::program::{Samples, Shape, announcements, program, steering};
 use super::socket::{UdpSocketLine, attach};
 
 /// Runs a program over a packet; the result is what `Return` says, 0 for a load beyond the packet.
@@ -69,12 +69,15 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
 const LARGEST: u32 = 60 * 1024 + 8;
 const SAMPLES: Samples =
     Samples { largest: LARGEST, repaired: false, any_vendor: false, repeated: false };
-const ANY_VENDOR: Samples = Samples { any_vendor: true, ..SAMPLES };
+const ANY_VENDOR: Samples = Samples { any_vendor: true, repeated: true, ..SAMPLES };
+
+/// With a UDP header, as the filter of a socket sees it.
+fn packet(datagram: &[u8]) -> Vec<u8> {
+    [&[0; 8][..], datagram].concat()
+}
 
 fn passes_shape(shape: Shape, samples: Samples, datagram: &[u8]) -> bool {
-    let mut packet = vec![0; 8];
-    packet.extend_from_slice(datagram);
-    interpret(&program(shape, samples).unwrap(), &packet) != 0
+    interpret(&program(shape, samples).unwrap(), &packet(datagram)) != 0
 }
 
 /// Whether a datagram passes; both shapes must agree.
@@ -487,6 +490,48 @@ fn what_other_implementations_send_passes_only_where_they_are_expected() {
         assert!(passes_of(ANY_VENDOR, &message(&[e.data_frag(1, 1, 300, 1024)])));
         assert!(!passes_of(ANY_VENDOR, &message(&[e.data_frag(1, 1, 255, 1024)])));
     }
+}
+
+/// A DATA of the writer of announcements, or another.
+fn data_of(writer: [u8; 4]) -> Vec<u8> {
+    let body = [&[0, 0, 16, 0, 0, 1, 0, 0xc7][..], &writer, &[0; 8], &[0xff; 200]].concat();
+    Endian::Little.submessage(0x15, &body)
+}
+
+#[test]
+fn announcements_are_told_from_all_else() {
+    let e = Endian::Little;
+    let (spdp, sedp) = (data_of([0, 1, 0, 0xc2]), data_of([0, 0, 3, 0xc2]));
+    let (time, to, source) = (e.info_ts(), e.info_dst(), e.submessage(0x0c, &[0; 20]));
+    let [large, small] = Shape::both(ANY_VENDOR);
+    let is_announcement = |submessages: &[&Vec<u8>]| {
+        let datagram = message(submessages);
+        let whole = 1 << 18;
+        let kept = interpret(&program(large, ANY_VENDOR).unwrap(), &packet(&datagram));
+        assert_eq!(interpret(&program(small, ANY_VENDOR).unwrap(), &packet(&datagram)), kept);
+        let unrepeated = Samples { repeated: false, ..ANY_VENDOR };
+        let program = program(large, unrepeated).unwrap();
+        assert_eq!(interpret(&program, &packet(&datagram)), whole);
+        let is_one = interpret(&announcements().unwrap(), &packet(&datagram)) != 0;
+        assert_eq!(interpret(&steering().unwrap(), &datagram), u32::from(is_one));
+        assert_eq!(kept, if is_one { 28 } else { whole }, "the headers of UDP and RTPS");
+        is_one
+    };
+    for begin in [&[][..], &[&time], &[&to], &[&to, &time], &[&time, &to]] {
+        for (data, expected) in [(&spdp, true), (&sedp, false)] {
+            assert_eq!(is_announcement(&[begin, &[data]].concat()), expected);
+        }
+    }
+    assert!(!is_announcement(&[&source, &time, &spdp]), "it is repeated");
+    assert!(!is_announcement(&[]));
+    assert!(!is_announcement(&[&time]));
+    for length in 0..48 {
+        let cut = &message(&[&time, &spdp])[..length];
+        assert_eq!(interpret(&announcements().unwrap(), &packet(cut)), 0);
+        assert_eq!(interpret(&steering().unwrap(), cut), 0);
+    }
+    let foreign = [&b"RTPX"[..], &message(&[&spdp])[4..]].concat();
+    assert_eq!(interpret(&steering().unwrap(), &foreign), 0);
 }
 
 /// As the multicast sockets of two participants of one process.
