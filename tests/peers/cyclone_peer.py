@@ -11,17 +11,16 @@ import uuid
 from pathlib import Path
 from types import SimpleNamespace
 
+import peer
 from cyclonedds.core import Listener, Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
-from cyclonedds.pub import DataWriter
 from cyclonedds.internal import InvalidSample
+from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from rclpy.serialization import deserialize_message, serialize_message
-
-import peer
 
 HEADER = b"\0\1\0\0"
 INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"

@@ -5,7 +5,9 @@ import threading
 import time
 from types import SimpleNamespace
 
+import peer
 import rclpy
+import tf_message
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
@@ -14,9 +16,6 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from test_msgs.action import Fibonacci
-
-import peer
-import tf_message
 
 
 def profile(given: dict) -> QoSProfile:
