@@ -33,7 +33,7 @@ use socket2::{Domain, SockRef, Socket, Type};
 use super::filter::{FilterError, keep_announcements, steer};
 use super::reader::StoppableThread;
 use super::{DdsError, GuidPrefix, create_error, farewell, multicast_port};
-use message::{Outgoing, Spdp};
+use message::{Gone, Outgoing, Spdp};
 
 /// Where participants announce themselves.
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
@@ -129,6 +129,7 @@ impl Metatraffic {
             sockets,
             own,
             participants: HashMap::new(),
+            gone: Gone::default(),
             dropped: Arc::clone(&dropped),
             buffer: vec![0; 65_536],
         };
@@ -174,6 +175,7 @@ struct Worker {
     sockets: Sockets,
     own: GuidPrefix,
     participants: HashMap<GuidPrefix, Remote>,
+    gone: Gone,
     dropped: Arc<AtomicU64>,
     buffer: Vec<u8>,
 }
@@ -243,13 +245,13 @@ impl Worker {
     }
 
     /// RustDDS has not counted as far, so it is new.
-    fn say_good_bye(&self) {
+    fn say_good_bye(&mut self) {
         self.send(&farewell::datagram(self.own, FAREWELL));
     }
 
     /// Sends on what RustDDS sends.
-    fn send(&self, datagram: &[u8]) -> Option<()> {
-        let outgoing = Outgoing::amend(datagram, self.own)?;
+    fn send(&mut self, datagram: &[u8]) -> Option<()> {
+        let outgoing = Outgoing::amend(datagram, self.own, &mut self.gone)?;
         let is_meant = |it: &GuidPrefix| outgoing.to.is_empty() || outgoing.to.contains(it);
         let meant = self.participants.iter().filter(|(prefix, _)| is_meant(prefix));
         let sent = meant
