@@ -33,7 +33,7 @@ use socket2::{Domain, SockRef, Socket, Type};
 use super::filter::{FilterError, keep_announcements, steer};
 use super::reader::StoppableThread;
 use super::{DdsError, GuidPrefix, create_error, farewell, multicast_port};
-use message::{Outgoing, Spdp};
+use message::{Gone, Outgoing, Spdp};
 
 /// Where participants announce themselves.
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
@@ -46,6 +46,8 @@ const MAX_ADDRESSES: usize = 4;
 const SILENCE: Duration = Duration::from_secs(120);
 /// How soon the end is noticed, and silence looked for.
 const LISTEN: u8 = 50;
+/// RustDDS hangs that does not end so soon.
+const HANG: Duration = Duration::from_millis(500);
 /// Number of the good-bye.
 const FAREWELL: u32 = u32::MAX;
 /// Datagrams that are taken of one socket before the others have their turn.
@@ -108,6 +110,7 @@ fn listen(port: u16, address: Ipv4Addr) -> io::Result<Socket> {
 /// Works until it is dropped, after which the good-bye of RustDDS has left. Drop it last.
 pub(super) struct Metatraffic {
     dropped: Arc<AtomicU64>,
+    ends: Arc<AtomicBool>,
     _thread: StoppableThread,
 }
 
@@ -126,19 +129,34 @@ impl Metatraffic {
             sockets,
             own,
             participants: HashMap::new(),
+            gone: Gone::default(),
             dropped: Arc::clone(&dropped),
             buffer: vec![0; 65_536],
         };
+        let ends = Arc::<AtomicBool>::default();
+        let ends_now = Arc::clone(&ends);
         let thread = StoppableThread::start("dds-metatraffic", failed, move |stop| {
+            let mut ends_since = None;
             while !stop.load(Ordering::Relaxed) {
                 worker.wait();
-                worker.turn(Instant::now());
+                let now = Instant::now();
+                worker.turn(now);
+                if ends_now.load(Ordering::Relaxed)
+                    && now.duration_since(*ends_since.get_or_insert(now)) > HANG
+                {
+                    ends_now.store(false, Ordering::Relaxed);
+                    worker.say_good_bye();
+                }
             }
             worker.turn(Instant::now());
-            // RustDDS has not counted as far, so it is new.
-            worker.send(&farewell::datagram(own, FAREWELL));
+            worker.say_good_bye();
         })?;
-        Ok(Self { dropped, _thread: thread })
+        Ok(Self { dropped, ends, _thread: thread })
+    }
+
+    /// RustDDS is being ended, and may hang: the good-bye waits a moment for it.
+    pub(super) fn note_end(&self) {
+        self.ends.store(true, Ordering::Relaxed);
     }
 
     /// Datagrams that were malformed, or could not be sent on.
@@ -157,6 +175,7 @@ struct Worker {
     sockets: Sockets,
     own: GuidPrefix,
     participants: HashMap<GuidPrefix, Remote>,
+    gone: Gone,
     dropped: Arc<AtomicU64>,
     buffer: Vec<u8>,
 }
@@ -225,9 +244,14 @@ impl Worker {
         is_kept
     }
 
+    /// RustDDS has not counted as far, so it is new.
+    fn say_good_bye(&mut self) {
+        self.send(&farewell::datagram(self.own, FAREWELL));
+    }
+
     /// Sends on what RustDDS sends.
-    fn send(&self, datagram: &[u8]) -> Option<()> {
-        let outgoing = Outgoing::amend(datagram, self.own)?;
+    fn send(&mut self, datagram: &[u8]) -> Option<()> {
+        let outgoing = Outgoing::amend(datagram, self.own, &mut self.gone)?;
         let is_meant = |it: &GuidPrefix| outgoing.to.is_empty() || outgoing.to.contains(it);
         let meant = self.participants.iter().filter(|(prefix, _)| is_meant(prefix));
         let sent = meant

@@ -213,6 +213,14 @@ pub struct Participant {
     metatraffic: Option<Metatraffic>,
 }
 
+impl Drop for Participant {
+    fn drop(&mut self) {
+        if let Some(metatraffic) = &self.metatraffic {
+            metatraffic.note_end();
+        }
+    }
+}
+
 impl fmt::Debug for Participant {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Participant {} on {} port {}", self.prefix, self.config.address, self.port)

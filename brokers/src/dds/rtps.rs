@@ -2,14 +2,14 @@
 
 use super::GuidPrefix;
 
-pub(super) const HEADER_LENGTH: usize = 20;
+const HEADER_LENGTH: usize = 20;
 const PAD: u8 = 0x01;
 const INFO_TS: u8 = 0x09;
 pub(super) const INFO_SRC: u8 = 0x0c;
 pub(super) const INFO_DST: u8 = 0x0e;
 pub(super) const DATA: u8 = 0x15;
 pub(super) const FLAG_LITTLE_ENDIAN: u8 = 0x01;
-const FLAG_INLINE_QOS: u8 = 0x02;
+pub(super) const FLAG_INLINE_QOS: u8 = 0x02;
 pub(super) const FLAG_DATA: u8 = 0x04;
 pub(super) const FLAG_KEY: u8 = 0x08;
 /// Writer of participants' announcements.
@@ -114,6 +114,11 @@ impl<'a> Submessage<'a> {
 impl<'a> Data<'a> {
     pub(super) fn is_announcement(&self) -> bool {
         self.writer == SPDP_WRITER && self.flags & FLAG_DATA != 0
+    }
+
+    /// Whether it tells that something ceases, by its key.
+    pub(super) fn is_end(&self) -> bool {
+        self.flags & (FLAG_KEY | FLAG_DATA) == FLAG_KEY && !self.inline.is_empty()
     }
 
     /// Visits the parameters that the payload consists of; returns their byte order.

@@ -1,6 +1,6 @@
 //! Announcements as RustDDS gets them, and what RustDDS sends as others get it.
 
-use std::borrow::Cow;
+use std::collections::HashSet;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::Duration;
 
@@ -8,8 +8,8 @@ use bytes::BufMut;
 
 use super::GuidPrefix;
 use crate::dds::rtps::{
-    Data, FLAG_DATA, FLAG_KEY, FLAG_LITTLE_ENDIAN, HEADER_LENGTH, INFO_DST, INFO_SRC, Message,
-    SPDP_WRITER, Submessage, after_parameters, read_u32,
+    Data, FLAG_INLINE_QOS, FLAG_KEY, FLAG_LITTLE_ENDIAN, INFO_DST, INFO_SRC, Message, SPDP_WRITER,
+    Submessage, after_parameters, read_u32,
 };
 
 /// Writers of discovery: of participants, writers and readers.
@@ -23,7 +23,12 @@ const PID_KEY_HASH: u16 = 0x0070;
 const PID_SENTINEL: u16 = 0x0001;
 const LOCATOR_UDP_V4: u32 = 1;
 const LOCATOR_LENGTH: u16 = 24;
-const GUID_LENGTH: u16 = 16;
+const PID_STATUS_INFO: u16 = 0x0071;
+/// Disposed and unregistered, in any byte order.
+const DISPOSED: [u8; 4] = [0, 0, 0, 3];
+/// RustDDS keeps what it has told of all of them. Further ones are there for late joiners until
+/// they hear the contrary.
+const MAX_GONE: usize = 100_000;
 /// Where nothing is told.
 const DEFAULT_LEASE: Duration = Duration::from_secs(100);
 
@@ -144,63 +149,86 @@ fn with_metatraffic(data: &Data<'_>, to: SocketAddrV4) -> Option<Vec<u8>> {
 }
 
 /// What RustDDS sends to the metatraffic of others.
-pub(super) struct Outgoing<'a> {
-    pub(super) datagram: Cow<'a, [u8]>,
+pub(super) struct Outgoing {
+    pub(super) datagram: Vec<u8>,
     /// To which of them it goes; empty: to all.
     pub(super) to: Vec<GuidPrefix>,
 }
 
-impl<'a> Outgoing<'a> {
-    /// Adds the hashes of keys where something ceases. `None` for what is not of `own`, and for what
+/// Own participants, readers and writers that have ceased.
+#[derive(Default)]
+pub(super) struct Gone(HashSet<[u8; 16]>);
+
+impl Outgoing {
+    /// Adds the hashes of keys where something ceases, and lets what has ceased cease again where
+    /// RustDDS tells late joiners that it was there. `None` for what is not of `own`, and for what
     /// is malformed.
-    pub(super) fn amend(datagram: &'a [u8], own: GuidPrefix) -> Option<Self> {
+    pub(super) fn amend(datagram: &[u8], own: GuidPrefix, gone: &mut Gone) -> Option<Self> {
         let message = Message::parse(datagram).filter(|it| it.prefix() == own)?;
+        let submessages: Vec<_> = message.submessages().collect::<Option<_>>()?;
         let mut to = Vec::new();
-        let mut amended = Vec::new();
-        for (submessage, at) in message.submessages().zip(0..) {
-            let submessage = submessage?;
+        for submessage in &submessages {
             if submessage.kind == INFO_DST {
                 to.push(GuidPrefix(*submessage.body.first_chunk()?));
             }
-            amended.extend(ceases(&submessage).map(|(data, key)| (at, data, key)));
+            gone.0.extend(key(submessage).filter(|(data, _)| data.is_end()).map(|(_, key)| key));
         }
-        if amended.is_empty() {
-            return Some(Self { datagram: Cow::Borrowed(datagram), to });
+        if gone.0.len() > MAX_GONE {
+            gone.0.clear();
         }
-        let mut amended = amended.into_iter().peekable();
         let mut out = Vec::with_capacity(datagram.len() + 256);
-        out.put_slice(&datagram[..HEADER_LENGTH]);
-        for (submessage, at) in message.submessages().zip(0..) {
-            let submessage = submessage?;
-            match amended.next_if(|(place, ..)| *place == at) {
-                Some((_, data, key)) => {
-                    let mut hash = Vec::with_capacity(20);
-                    put_parameter(&mut hash, PID_KEY_HASH, key, submessage.is_little())?;
-                    put(&mut out, submessage, &[data.head, &hash, data.inline, data.payload])?;
-                }
+        out.put_slice(message.header);
+        for submessage in &submessages {
+            match amended(submessage, gone) {
+                Some(amended) => out.put_slice(&amended),
                 None => out.put_slice(submessage.whole),
             }
         }
-        Some(Self { datagram: Cow::Owned(out), to })
+        Some(Self { datagram: out, to })
     }
 }
 
-/// The key of a participant, reader or writer that ceases, if there is no hash of it.
-fn ceases<'a>(submessage: &Submessage<'a>) -> Option<(Data<'a>, &'a [u8])> {
+/// What a DATA of discovery is about.
+fn key<'a>(submessage: &Submessage<'a>) -> Option<(Data<'a>, [u8; 16])> {
     let data = submessage.data().filter(|it| WRITERS.contains(&it.writer))?;
-    if data.flags & (FLAG_KEY | FLAG_DATA) != FLAG_KEY || data.inline.is_empty() {
-        return None;
-    }
-    let mut has_hash = false;
-    after_parameters(data.inline, submessage.is_little(), |id, _| has_hash |= id == PID_KEY_HASH)?;
+    let wanted = if data.writer == SPDP_WRITER { PID_PARTICIPANT_GUID } else { PID_ENDPOINT_GUID };
     let mut key = None;
-    // RustDDS leaves the end of this list out.
+    // RustDDS leaves the end of this list out where something ceases.
     let _ = data.visit_payload(|id, value| {
-        if matches!(id, PID_PARTICIPANT_GUID | PID_ENDPOINT_GUID) {
-            key = Some(value);
+        if id == wanted {
+            key = value.try_into().ok();
         }
     });
-    key.filter(|key| !has_hash && key.len() == usize::from(GUID_LENGTH)).map(|key| (data, key))
+    key.map(|key| (data, key))
+}
+
+/// The submessage as it is to be, if it changes.
+fn amended(submessage: &Submessage<'_>, gone: &Gone) -> Option<Vec<u8>> {
+    let is_little = submessage.is_little();
+    let (data, key) = key(submessage)?;
+    let (mut inline, mut out) = (Vec::new(), Vec::new());
+    put_parameter(&mut inline, PID_KEY_HASH, &key, is_little)?;
+    if data.is_end() {
+        let mut has_hash = false;
+        after_parameters(data.inline, is_little, |id, _| has_hash |= id == PID_KEY_HASH)?;
+        if has_hash {
+            return None;
+        }
+        inline.put_slice(data.inline);
+        put(&mut out, *submessage, &[data.head, &inline, data.payload])?;
+    } else if gone.0.contains(&key) {
+        put_parameter(&mut inline, PID_STATUS_INFO, &DISPOSED, is_little)?;
+        put_parameter(&mut inline, PID_SENTINEL, &[], is_little)?;
+        let mut payload = data.payload.get(..4)?.to_vec();
+        let is_little = payload[1] & 1 != 0;
+        put_parameter(&mut payload, PID_ENDPOINT_GUID, &key, is_little)?;
+        put_parameter(&mut payload, PID_SENTINEL, &[], is_little)?;
+        let flags = submessage.flags & FLAG_LITTLE_ENDIAN | FLAG_INLINE_QOS | FLAG_KEY;
+        put(&mut out, Submessage { flags, ..*submessage }, &[data.head, &inline, &payload])?;
+    } else {
+        return None;
+    }
+    Some(out)
 }
 
 /// Puts a submessage with another body; `None` where it would be too long.
