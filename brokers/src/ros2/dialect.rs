@@ -2,7 +2,7 @@
 
 use std::net::Ipv4Addr;
 use std::sync::{Arc, OnceLock, Weak};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, ServiceName, WriterId};
 use blaze_proto::{Frame, Header};
@@ -35,6 +35,8 @@ const SEND_BUFFER: usize = 8 * 1024 * 1024;
 const AROUND_PAYLOAD: usize = 16;
 /// Samples of the graph that wait to be read: each participant keeps one.
 const GRAPHS: u16 = 1024;
+/// How long a reply waits until its client's reader is found.
+const MEET_CLIENT: Duration = Duration::from_secs(1);
 /// RTPS: the entity that stands for the participant itself.
 const PARTICIPANT: [u8; 4] = [0x00, 0x00, 0x01, 0xc1];
 
@@ -177,7 +179,15 @@ impl Dialect for Ros {
         } else {
             let answered = frame.related().and_then(|request| services.asked(&request));
             // Its client has gone, or has its reply.
-            Some(answered.ok_or(DropReason::NoDestination)?)
+            let (known_as, asked) = answered.ok_or(DropReason::NoDestination)?;
+            // A reader that RustDDS has just found may not be served yet.
+            if let OnWire::Related(reader, _) = known_as
+                && asked.elapsed() < MEET_CLIENT
+                && !self.knowledge.has_met(Instant::now(), &reader)
+            {
+                return Ok(Written::Full);
+            }
+            Some(known_as)
         };
         let (payload, related) = known_as
             .map_or((cdr.payload().clone(), None), |known_as| known_as.put_on(cdr.payload()));
@@ -217,7 +227,8 @@ impl Ros {
             Carries::Requests => {
                 let (known_as, payload) =
                     OnWire::of_request(writer.vendor, sample).ok_or(NoMessage::Malformed)?;
-                self.services.lock().note_asked((WriterId(writer.id), sequence), known_as);
+                let request = (WriterId(writer.id), sequence);
+                self.services.lock().note_asked(Instant::now(), request, known_as);
                 Ok((payload, None))
             }
             Carries::Replies => {

@@ -20,6 +20,8 @@ use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix, participant_o
 pub const MAX_ENDPOINTS: usize = 10_000;
 /// Participants whose nodes are known.
 const MAX_PARTICIPANTS: usize = 1024;
+/// RustDDS serves an endpoint so soon after it is found.
+const SERVED_AFTER: Duration = Duration::from_millis(20);
 /// An endpoint whose node has not been told counts after this time.
 const NODE_WAIT: Duration = Duration::from_millis(300);
 
@@ -185,6 +187,13 @@ impl Knowledge {
         let state = self.state.lock();
         let found = state.by_name.get(name).map(|of_name| &of_name[usize::from(writers)]);
         found.cloned().unwrap_or_default()
+    }
+
+    /// Whether an endpoint has been known for as long as RustDDS takes to serve it.
+    pub(super) fn has_met(&self, now: Instant, id: &EndpointId) -> bool {
+        let state = self.state.lock();
+        let entry = state.endpoints.get(id);
+        entry.is_some_and(|entry| now.saturating_duration_since(entry.since) >= SERVED_AFTER)
     }
 
     /// Whether the first server that reads these requests is of Cyclone.
@@ -356,6 +365,17 @@ mod tests {
         knowledge.set_owned([(told.id, true)].into());
         knowledge.note_endpoints(now + NODE_WAIT, &writers(vec![silent]));
         assert_eq!(names(&knowledge), [("/b".to_owned(), None)]);
+    }
+
+    #[test]
+    fn an_endpoint_is_served_a_moment_after_it_was_found() {
+        let now = Instant::now();
+        let knowledge = Knowledge::new();
+        let one = found(1, "rr/addReply", TYPE);
+        assert!(!knowledge.has_met(now, &one.id));
+        knowledge.note_endpoints(now, &writers(vec![one.clone()]));
+        assert!(!knowledge.has_met(now, &one.id));
+        assert!(knowledge.has_met(now + SERVED_AFTER, &one.id));
     }
 
     #[test]

@@ -11,6 +11,7 @@
 //! a reply names writer and number of the request.
 
 use std::collections::{BTreeMap, HashMap};
+use std::time::Instant;
 
 use blaze_domain::WriterId;
 use bytes::{BufMut, Bytes, BytesMut};
@@ -178,8 +179,8 @@ pub(super) struct Services {
 
 #[derive(Default)]
 pub(super) struct State {
-    /// Of clients on this network: how they know their requests.
-    asked: ByRequest<OnWire>,
+    /// Of clients on this network: how they know their requests, and when those came.
+    asked: ByRequest<(OnWire, Instant)>,
     /// Written here for clients elsewhere: how the server knows them, and on which DDS topic.
     forwarded: ByRequest<(OnWire, String)>,
     by_wire: HashMap<OnWire, Forwarded>,
@@ -199,12 +200,13 @@ impl Services {
 
 impl State {
     /// A client on this network asks.
-    pub(super) fn note_asked(&mut self, request: Request, known_as: OnWire) {
-        self.given_up += self.asked.insert(request, known_as).len() as u64;
+    pub(super) fn note_asked(&mut self, now: Instant, request: Request, known_as: OnWire) {
+        self.given_up += self.asked.insert(request, (known_as, now)).len() as u64;
     }
 
-    /// How the client of a request knows it; `None`: it is not waited for any more.
-    pub(super) fn asked(&self, request: &Request) -> Option<OnWire> {
+    /// How the client of a request knows it, and when it came; `None`: it is not waited for any
+    /// more.
+    pub(super) fn asked(&self, request: &Request) -> Option<(OnWire, Instant)> {
         self.asked.all.get(request).copied()
     }
 
@@ -313,14 +315,14 @@ mod tests {
     fn of_too_many_requests_of_a_client_the_oldest_is_given_up() {
         let mut state = State::default();
         for number in 1..=MAX_OF_CLIENT as u64 + 2 {
-            state.note_asked((CLIENT, number), OnWire::Related([1; 16], 1));
+            state.note_asked(Instant::now(), (CLIENT, number), OnWire::Related([1; 16], 1));
         }
         assert_eq!(state.counts(), (MAX_OF_CLIENT, 2));
         assert_eq!(state.asked(&(CLIENT, 2)), None);
         assert!(state.asked(&(CLIENT, 3)).is_some(), "until its reply is written");
         state.note_answered(&(CLIENT, 3));
         assert_eq!(state.asked(&(CLIENT, 3)), None);
-        state.note_asked((WriterId([2; 16]), 1), OnWire::Related([2; 16], 1));
+        state.note_asked(Instant::now(), (WriterId([2; 16]), 1), OnWire::Related([2; 16], 1));
         state.retain(|client| *client != CLIENT, |_| true);
         assert_eq!(state.counts(), (1, 2), "the client has gone");
         assert_eq!(state.asked.of_client.len(), 1);
