@@ -41,9 +41,11 @@ fn network(shared: &Shared, ros2: &Ros2Scope, seen: &[Seen]) -> Value {
         _ => "down",
     };
     let mut detail = in_use.unwrap_or(status.detail);
+    let (pending, given_up) = ros2.broker.requests();
     for (count, what) in [
-        (network.refused, "endpoints beyond the limit"),
-        (ros2.refused_shows(), "topics that other flows offer beyond those that may show"),
+        (network.refused as u64, "endpoints beyond the limit"),
+        (ros2.refused_shows() as u64, "topics that other flows offer beyond those that may show"),
+        (given_up, "requests were given up, since too many of their clients waited (queue_full)"),
     ] {
         if count > 0 {
             detail = format!("{detail}; {count} {what}");
@@ -54,7 +56,7 @@ fn network(shared: &Shared, ros2: &Ros2Scope, seen: &[Seen]) -> Value {
         "domain": ros2.domain, "interface": ros2.interface, "state": state, "detail": detail,
         "guid_prefix": network.own.map(|own| own.to_string()), "node": shared.me.ros2_node(),
         "participants": network.participants, "endpoints": endpoints,
-        "calls": {"pending": ros2.broker.requests().0},
+        "calls": {"pending": pending},
     })
 }
 
