@@ -19,7 +19,6 @@ use crate::dds::adapter::{
     Admission, Companion, Decoded, Dialect, Encoded, NoMessage, Others, Topic, nanos,
 };
 use crate::dds::participant::{RawReader, prefix_of};
-
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
     Relay, Sample, Terms, Writer, Written, endpoint_of, take_up_to,

@@ -220,8 +220,9 @@ impl State {
     pub(super) fn next_header(&mut self, own: &EndpointId) -> OnWire {
         self.last += 1;
         let mut header = [0; CYCLONE_HEADER];
-        header[..8].copy_from_slice(&own[..8]);
-        // The same participant may have several writers of one service.
+        // Another flow of this network has other bytes of chance there, another writer of this one
+        // another entity.
+        header[..4].copy_from_slice(&own[4..8]);
         header[4..8].copy_from_slice(&own[12..]);
         header[8..].copy_from_slice(&self.last.to_le_bytes());
         OnWire::Header(header)
@@ -305,6 +306,11 @@ mod tests {
         assert_eq!(state.take_forwarded(&OnWire::Related([8; 16], 1)), None);
         let headers = [state.next_header(&[7; 16]), state.next_header(&[7; 16])];
         assert_ne!(headers[0], headers[1]);
+        let of_flow = |chance: u8| {
+            let own = [1, 0x12, 0, 0, chance, 0, 0, 0, 0, 0, 0, 0, 0, 0, 5, 3];
+            State::default().next_header(&own)
+        };
+        assert_ne!(of_flow(1), of_flow(2), "each flow has its own");
         assert_eq!(state.counts(), (2, 0));
         state.retain(|_| true, |topic| topic != "rq/addRequest");
         assert_eq!(state.counts(), (0, 0), "the server has gone");
