@@ -342,6 +342,10 @@ impl Channels {
         self.all.lock().values().map(Arc::clone).collect()
     }
 
+    pub(super) fn undecided_bytes(&self) -> usize {
+        self.doubtful.load(Ordering::Acquire)
+    }
+
     /// All channels are looked at, though nothing came.
     pub(super) fn look_again(&self) {
         for channel in self.list() {

@@ -183,6 +183,8 @@ pub struct DdsCounts {
     pub rebuilds: u64,
     /// Participants to whom good-bye was said in their absence.
     pub expelled: u64,
+    /// Bytes of samples that wait now until it is known whether they are read.
+    pub undecided_bytes: usize,
 }
 
 /// A participant with its threads.
@@ -213,7 +215,8 @@ impl Adapter {
     }
 
     pub(crate) fn counts(&self) -> DdsCounts {
-        *self.shared.counts.lock()
+        let undecided_bytes = self.shared.channels.undecided_bytes();
+        DdsCounts { undecided_bytes, ..*self.shared.counts.lock() }
     }
 
     pub(crate) fn status(&self) -> watch::Receiver<BrokerStatus> {
