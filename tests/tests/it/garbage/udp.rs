@@ -1,9 +1,11 @@
-//! Garbage at all DDS ports of a process, while another one receives messages from it.
+//! Garbage at all DDS ports of a process, on the link and on a ROS 2 network, while another one
+//! receives messages from it.
 
 use std::collections::BTreeSet;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, Instant};
 
+use blaze_brokers::dds::{Participant, ParticipantConfig, Profile, Writer};
 use blaze_tests::admin::Admin;
 use blaze_tests::flow::free_domain;
 use blaze_tests::process::Process;
@@ -142,12 +144,29 @@ fn delivered(admin: &Admin) -> f64 {
     admin.metric(name, &["topic=\"imu/data\"", "direction=\"out\"", "to=\"layer\""]).unwrap_or(0.0)
 }
 
+/// A ROS 2 node with a writer comes, and the flow finds it.
+fn meet_a_node(domain: u16, admin: &Admin, process: &Process) -> (Participant, Writer) {
+    let found = || {
+        let labels = ["kind=\"publisher\""];
+        admin.metric("blaze_ros2_endpoints", &labels).unwrap_or(0.0)
+    };
+    let before = found();
+    let node = Participant::start(ParticipantConfig::new(domain, Ipv4Addr::LOCALHOST)).unwrap();
+    let topic = ("rt/met", "std_msgs::msg::dds_::UInt8_");
+    let writer = node.typed_writer(topic, Profile::best_effort(1)).unwrap();
+    wait::until("a node is found", RECOVERY, || found() > before, || process.tail()).unwrap();
+    (node, writer)
+}
+
 #[test]
 fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
-    let domain = free_domain().unwrap();
-    let set = format!("brokers.inter.dds.domain={domain}");
-    let arguments = |node| ["demo", "--only", node, "--duration", "10m", "--set", set.as_str()];
-    let mut robot = Process::start("blaze", &arguments("robot-1"), None).unwrap();
+    let [domain, ros_domain] = [(); 2].map(|()| free_domain().unwrap());
+    let link = format!("brokers.inter.dds.domain={domain}");
+    let ros2 = format!("brokers.plugins=[{{ros2: {{domain: {ros_domain}}}}}]");
+    let arguments = |node| vec!["demo", "--only", node, "--duration", "10m", "--set", &link];
+    let mut on_ros2 = arguments("robot-1");
+    on_ros2.extend(["--set", &ros2]);
+    let mut robot = Process::start("blaze", &on_ros2, None).unwrap();
     let mut fog = Process::start("blaze", &arguments("fog-1"), None).unwrap();
     let robot_admin = robot.node_ready("robot-1", DEADLINE).unwrap();
     let fog_admin = fog.node_ready("fog-1", DEADLINE).unwrap();
@@ -157,7 +176,8 @@ fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
             .unwrap()
     };
     flow(DEADLINE, "messages flow before", &fog);
-    let heard = announcements(domain);
+    let _early = meet_a_node(ros_domain, &robot_admin, &robot);
+    let heard = [domain, ros_domain].map(announcements).concat();
     let ports: Vec<u16> = udp_ports(&robot).union(&udp_ports(&fog)).copied().collect();
     assert!(ports.len() >= 4, "two processes hold {ports:?}");
     let before = [robot.resident_bytes().unwrap(), fog.resident_bytes().unwrap()];
@@ -182,6 +202,7 @@ fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
     }
     let storm = begin.elapsed();
     let recovered = flow(RECOVERY, "messages flow again", &fog);
+    meet_a_node(ros_domain, &robot_admin, &robot);
     for (name, process, admin) in
         [("robot-1", &mut robot, &robot_admin), ("fog-1", &mut fog, &fog_admin)]
     {
