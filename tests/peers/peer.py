@@ -18,9 +18,12 @@ node is a DDS participant of its own. Names of endpoints are the caller's, uniqu
   client        name, node, service, type                  -> {}
   available     name                                       -> ready       a server of that client, or an action client
   call          name, request, timeout_ms                  -> reply
+  calls         names, field, count, timeout_ms            -> {}          starts: all clients at once, each one call after another
+  called                                                   -> answered, faults, busy
+      an integer field tells each request from all others; faults: calls without their own reply, as text
   served        name                                       -> count       of requests, goals for an action
 Only rclpy:
-  action_server name, node, action                         -> {}          test_msgs/action/Fibonacci
+  action_server name, node, action, step_ms (10)           -> {}          test_msgs/action/Fibonacci
   action_client name, node, action                         -> {}
   goal          name, order, timeout_ms                    -> status, feedback, sequence
   cancel        name, order, timeout_ms                    -> status      cancelled after the first feedback
@@ -41,6 +44,7 @@ import struct
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 QOS = {"reliable": True, "durable": False, "depth": 10, "deadline_ms": 0, "lease_ms": 0, "lifespan_ms": 0}
 
@@ -94,6 +98,30 @@ class Peer:
         log = self.ends[name].log
         busy = log.busy
         return {"messages": log.messages[options.get("from", 0):], "busy": busy}  # fmt: skip
+
+    def op_calls(self, names, field, count, timeout_ms) -> dict:
+        self.calls = SimpleNamespace(answered=0, faults=[], busy=len(names), lock=threading.Lock())
+        for index, name in enumerate(names):
+            given = (name, field, range(index * count, (index + 1) * count), timeout_ms)
+            threading.Thread(target=self.call_all, args=given, daemon=True).start()
+        return {}
+
+    def call_all(self, name, field, values, timeout_ms) -> None:
+        for value in values:
+            try:
+                got = self.op_call(name, {field: value}, timeout_ms)["reply"][field]
+                fault = None if got == value else f"{name} got {got} for {value}"
+            except Exception as error:
+                fault = f"{name} got {error!r} for {value}"
+            with self.calls.lock:
+                self.calls.answered += fault is None
+                self.calls.faults += [fault] if fault else []
+        with self.calls.lock:
+            self.calls.busy -= 1
+
+    def op_called(self) -> dict:
+        with self.calls.lock:
+            return {"answered": self.calls.answered, "faults": self.calls.faults[:10], "busy": self.calls.busy > 0}
 
     def run(self, rmw: str) -> None:
         print(json.dumps({"ready": rmw}), flush=True)

@@ -17,6 +17,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from test_msgs.action import Fibonacci
 
+# Numbers of a Fibonacci sequence stay below it, however long that is.
+LARGEST = 2**31
+
 
 def profile(given: dict) -> QoSProfile:
     given = {**peer.QOS, **given}
@@ -134,7 +137,7 @@ class Ros2Peer(peer.Peer):
     def op_served(self, name) -> dict:
         return {"count": self.ends[name].count}
 
-    def op_action_server(self, name, node, action) -> dict:
+    def op_action_server(self, name, node, action, step_ms=10) -> dict:
         end, node = self.end(name, node, "test_msgs/action/Fibonacci")
 
         def execute(goal):
@@ -144,9 +147,9 @@ class Ros2Peer(peer.Peer):
                 if goal.is_cancel_requested:
                     goal.canceled()
                     return Fibonacci.Result()
-                sequence.append(sequence[-1] + sequence[-2])
+                sequence.append((sequence[-1] + sequence[-2]) % LARGEST)
                 goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
-                time.sleep(0.01)
+                time.sleep(step_ms / 1e3)
             goal.succeed()
             return Fibonacci.Result(sequence=sequence)
 

@@ -193,7 +193,11 @@ impl Peer {
     /// # Errors
     /// With what the peer says.
     pub fn ask(&self, command: &Value) -> anyhow::Result<Value> {
-        let answer = self.dialogue.ask(command, ANSWER)?;
+        self.ask_within(command, ANSWER)
+    }
+
+    fn ask_within(&self, command: &Value, deadline: Duration) -> anyhow::Result<Value> {
+        let answer = self.dialogue.ask(command, deadline)?;
         anyhow::ensure!(answer["error"].is_null(), "{:?}: {command}: {answer}", self.release);
         Ok(answer)
     }
@@ -257,6 +261,32 @@ impl Peer {
         Ok(End { peer: self, name })
     }
 
+    /// Lets clients call their services, all at once, and each so many times. An integer `field`
+    /// tells each request from all others. Gives how many got their own reply, and faults of some
+    /// that did not.
+    ///
+    /// # Errors
+    /// As [`Peer::ask`], and when that takes longer than `deadline`.
+    pub fn call_all(
+        &self,
+        clients: &[End<'_>],
+        field: &str,
+        count: usize,
+        deadline: Duration,
+    ) -> anyhow::Result<(usize, Vec<String>)> {
+        let names: Vec<&str> = clients.iter().map(|client| &*client.name).collect();
+        let timeout = u64::try_from(ANSWER.as_millis())?;
+        self.ask(&json!({
+            "op": "calls", "names": names, "field": field, "count": count, "timeout_ms": timeout,
+        }))?;
+        let called = || self.ask(&json!({ "op": "called" })).ok();
+        let ended = || called().filter(|answer| answer["busy"] == false);
+        let what = format!("the calls of {:?}", self.release);
+        let answer = wait::until_some(&what, deadline, ended, || format!("{:?}", called()))?;
+        let answered = answer["answered"].as_u64().context("no count")?;
+        Ok((usize::try_from(answered)?, Vec::deserialize(&answer["faults"])?))
+    }
+
     /// Its process id. `ip netns exec` replaces itself.
     #[must_use]
     pub fn id(&self) -> u32 {
@@ -279,9 +309,17 @@ pub struct End<'a> {
 }
 
 impl End<'_> {
-    fn ask(&self, mut command: Value) -> anyhow::Result<Value> {
+    fn ask(&self, command: Value) -> anyhow::Result<Value> {
+        self.ask_within(command, ANSWER)
+    }
+
+    /// The answer to any command that may take a while.
+    ///
+    /// # Errors
+    /// As [`Peer::ask`].
+    pub fn ask_within(&self, mut command: Value, deadline: Duration) -> anyhow::Result<Value> {
         command["name"] = json!(self.name);
-        self.peer.ask(&command)
+        self.peer.ask_within(&command, deadline)
     }
 
     /// Publishes messages, and does not wait until all are.
@@ -366,6 +404,17 @@ impl End<'_> {
     /// As [`End::publish`].
     pub fn available(&self) -> anyhow::Result<bool> {
         Ok(self.ask(json!({ "op": "available" }))?["ready"] == true)
+    }
+
+    /// Waits until a service or an action has a server, or none, seen from its client.
+    ///
+    /// # Errors
+    /// When that takes longer than `deadline`.
+    pub fn wait_available(&self, has: bool, deadline: Duration) -> anyhow::Result<Duration> {
+        let is_so = || self.available().is_ok_and(|available| available == has);
+        let word = if has { "a" } else { "no" };
+        let what = format!("a client of {:?} sees {word} server", self.peer.release);
+        wait::until(&what, deadline, is_so, String::new)
     }
 
     /// Calls a service and gives its reply.

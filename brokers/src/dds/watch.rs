@@ -50,10 +50,12 @@ impl FoundEndpoint {
         participant_of(&self.id)
     }
 
-    /// Whether a writer repairs losses, or a reader acknowledges.
+    /// Whether a writer repairs losses, or a reader acknowledges. A writer that says nothing does,
+    /// and a reader does not: Cyclone leaves out what is the default of DDS.
     #[must_use]
     pub fn is_reliable(&self) -> bool {
-        self.qos.is_reliable()
+        let is_writer = rustdds::GUID::from_bytes(self.id).entity_id.kind().is_writer();
+        self.qos.reliability().map_or(is_writer, |_| self.qos.is_reliable())
     }
 
     /// Whether it belongs to a flow.

@@ -10,11 +10,11 @@ use bytes::Bytes;
 use rustdds::{Timestamp, WriteOptionsBuilder};
 
 use super::Inner;
-use super::endpoint::RosEndpoint;
+use super::endpoint::{RosEndpoint, Vendor};
 use super::graph::{GRAPH_TOPIC, GidLength, Node, ParticipantNodes};
-use super::names::Carries;
+use super::names::{Carries, RosName};
 use super::network::Knowledge;
-use super::services::{Forwarded, OnWire, Services, carries};
+use super::services::{self, Forwarded, OnWire, Services, carries};
 use crate::dds::adapter::{
     Admission, Companion, Decoded, Dialect, Encoded, NoMessage, Others, Topic, nanos,
 };
@@ -71,6 +71,7 @@ impl Dialect for Ros {
     ) -> Result<Box<dyn Companion>, DdsError> {
         self.relay.set_participant(participant.prefix());
         self.knowledge.set_own(participant.prefix());
+        self.services.lock().forget_readers();
         let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,
@@ -101,8 +102,20 @@ impl Dialect for Ros {
         }
     }
 
+    fn note_reader(&self, topic: &Topic, reader: EndpointId, stands: bool) {
+        if carries(&topic.name) == Carries::Replies {
+            self.services.lock().note_reader(Instant::now(), &topic.name, reader, stands);
+        }
+    }
+
     fn admission(&self, topic: &Topic, writer: &EndpointId) -> Admission {
-        self.knowledge.admission(writer, &topic.type_name)
+        let admission = self.knowledge.admission(writer, &topic.type_name);
+        let is_request = || carries(&topic.name) == Carries::Requests;
+        if admission == Admission::Yes && is_request() && !self.services.lock().is_read(&topic.name)
+        {
+            return Admission::Later;
+        }
+        admission
     }
 
     fn decode(&self, topic: &Topic, sample: &Sample) -> Result<Decoded, NoMessage> {
@@ -162,48 +175,13 @@ impl Dialect for Ros {
         durable: bool,
         writer: &Writer,
     ) -> Result<Written, DropReason> {
-        let carries = carries(&topic.name);
         let Encoded { cdr, options } = self.encode(topic, message, durable)?;
         let Body::Frame(frame) = message else { return Err(DropReason::BrokerError) };
-        if carries == Carries::Messages {
-            return Ok(writer.write_cdr(cdr, options));
+        match carries(&topic.name) {
+            Carries::Messages => Ok(writer.write_cdr(cdr, options)),
+            Carries::Requests => self.write_request(topic, frame, (cdr, options), writer),
+            Carries::Replies => self.write_reply(frame, (cdr, options), writer),
         }
-        // Held until it is noted whose request it is: the server may answer at once.
-        let mut services = self.services.lock();
-        let request = (frame.writer(), frame.sequence());
-        let known_as = if carries == Carries::Requests {
-            self.knowledge
-                .is_served_by_cyclone(&topic.name)
-                .then(|| services.next_header(&writer.id()))
-        } else {
-            let answered = frame.related().and_then(|request| services.asked(&request));
-            // Its client has gone, or has its reply.
-            let (known_as, asked) = answered.ok_or(DropReason::NoDestination)?;
-            // A reader that RustDDS has just found may not be served yet.
-            if let OnWire::Related(reader, _) = known_as
-                && asked.elapsed() < MEET_CLIENT
-                && !self.knowledge.has_met(Instant::now(), &reader)
-            {
-                return Ok(Written::Full);
-            }
-            Some(known_as)
-        };
-        let (payload, related) = known_as
-            .map_or((cdr.payload().clone(), None), |known_as| known_as.put_on(cdr.payload()));
-        let cdr = Cdr::little(payload).ok_or(DropReason::BrokerError)?;
-        let written = writer.write_cdr(cdr, options.related_sample_identity_opt(related));
-        match (written, carries) {
-            (Written::Taken(number), Carries::Requests) => {
-                let known_as = known_as.unwrap_or(OnWire::Related(writer.id(), number));
-                let flow = format!("{}/{}", frame.origin_layer(), frame.origin_node());
-                services.note_forwarded(&topic.name, known_as, Forwarded { request, flow });
-            }
-            (Written::Taken(_), _) => {
-                frame.related().inspect(|request| services.note_answered(request));
-            }
-            _ => {}
-        }
-        Ok(written)
     }
 
     /// What a flow writes to the network it does not read from there.
@@ -213,6 +191,71 @@ impl Dialect for Ros {
 }
 
 impl Ros {
+    /// Writes a request when its reply can be read: a server may answer at once, and keeps nothing.
+    fn write_request(
+        &self,
+        topic: &Topic,
+        frame: &Frame,
+        (cdr, options): (Cdr, WriteOptionsBuilder),
+        writer: &Writer,
+    ) -> Result<Written, DropReason> {
+        let requests = RosName::of_dds(&topic.name).ok_or(DropReason::BrokerError)?;
+        let replies = RosName { carries: Carries::Replies, ..requests.clone() };
+        let (now, dds_replies) = (Instant::now(), replies.to_dds());
+        let known_for = self.knowledge.replies_for(now, &replies);
+        // Held until it is noted whose request it is: its reply may be read by then.
+        let mut services = self.services.lock();
+        if !services.may_ask(now, &topic.name, &dds_replies, known_for) {
+            return Ok(Written::Full);
+        }
+        let server = self.knowledge.server(&requests);
+        let (header, named) = match server {
+            Some(Vendor::CycloneDds) => (Some(services.next_header(&writer.id())), None),
+            Some(Vendor::FastDds) => (None, services.reader_to_name(&dds_replies, writer.id())),
+            _ => (None, None),
+        };
+        let (payload, _) =
+            header.map_or((cdr.payload().clone(), None), |header| header.put_on(cdr.payload()));
+        let cdr = Cdr::little(payload).ok_or(DropReason::BrokerError)?;
+        let options = options.related_sample_identity_opt(named.map(services::named));
+        let written = writer.write_cdr(cdr, options);
+        if let Written::Taken(number) = written {
+            let on_wire = || OnWire::Related(named.unwrap_or_else(|| writer.id()), number);
+            let request = (frame.writer(), frame.sequence());
+            let flow = format!("{}/{}", frame.origin_layer(), frame.origin_node());
+            let forwarded = Forwarded { request, flow };
+            services.note_forwarded(&topic.name, header.unwrap_or_else(on_wire), forwarded);
+        }
+        Ok(written)
+    }
+
+    /// Writes a reply as its client knows it.
+    fn write_reply(
+        &self,
+        frame: &Frame,
+        (cdr, options): (Cdr, WriteOptionsBuilder),
+        writer: &Writer,
+    ) -> Result<Written, DropReason> {
+        let request = frame.related().ok_or(DropReason::NoDestination)?;
+        let mut services = self.services.lock();
+        // Its client has gone, or has its reply.
+        let (known_as, asked) = services.asked(&request).ok_or(DropReason::NoDestination)?;
+        // A reader that RustDDS has just found may not be served yet.
+        if let OnWire::Related(reader, _) = known_as
+            && asked.elapsed() < MEET_CLIENT
+            && !self.knowledge.has_met(Instant::now(), &reader)
+        {
+            return Ok(Written::Full);
+        }
+        let (payload, related) = known_as.put_on(cdr.payload());
+        let cdr = Cdr::little(payload).ok_or(DropReason::BrokerError)?;
+        let written = writer.write_cdr(cdr, options.related_sample_identity_opt(related));
+        if matches!(written, Written::Taken(_)) {
+            services.note_answered(&request);
+        }
+        Ok(written)
+    }
+
     /// The payload of a sample as others send it, and which request it answers.
     fn of_service(
         &self,

@@ -204,10 +204,21 @@ pub(super) mod tests {
     }
 
     #[test]
+    fn a_writer_that_says_nothing_is_reliable_and_a_reader_is_not() {
+        let writer = found(1, "rt/a", "x");
+        assert!(RosEndpoint::of(&writer, true).unwrap().reliable, "the default of DDS");
+        let mut reader = writer.clone();
+        reader.id[15] = 0x04;
+        assert!(!RosEndpoint::of(&reader, false).unwrap().reliable);
+        let qos = QosPolicies::builder().best_effort().build();
+        assert!(!RosEndpoint::of(&FoundEndpoint { qos, ..writer }, true).unwrap().reliable);
+    }
+
+    #[test]
     fn what_is_missing_or_odd_is_left_out() {
         let plain = RosEndpoint::of(&found(1, "rt/a", "blaze::v1::Frame"), false).unwrap();
         assert_eq!((plain.type_name, plain.type_hash, plain.node), (None, None, None));
-        assert!(!plain.reliable && !plain.durable);
+        assert!(!plain.durable);
         assert_eq!(RosEndpoint::of(&found(1, "ros_discovery_info", "x"), true), None);
         let mut keyed = found(1, "rt/a", "x");
         keyed.id[15] = 0x02;

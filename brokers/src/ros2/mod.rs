@@ -39,7 +39,7 @@ use crate::port::{
     Subscription, SubscriptionSender,
 };
 use dialect::Ros;
-use names::{RosName, type_to_dds};
+use names::{Carries, RosName, type_to_dds};
 use network::Knowledge;
 use offers::{MAX_TYPES, Offer, Offered};
 use services::Services;
@@ -174,8 +174,9 @@ impl Ros2Broker {
         self.inner.adapter.look_again();
     }
 
-    /// Lets topics show on the network before anybody there asks for them, or no longer. Those with
-    /// names that ROS 2 cannot have are left out. Returns for how many there is no room.
+    /// Lets topics and services show on the network before anybody there asks for them, or no
+    /// longer. Those with names that ROS 2 cannot have are left out. Returns for how many there is no
+    /// room.
     pub fn show(&self, topics: impl IntoIterator<Item = (TopicName, Option<Shown>)>) -> usize {
         let inner = &self.inner;
         let mut refused = 0;
@@ -237,6 +238,7 @@ impl Broker for Ros2Broker {
             Read { topic, name, sender, options, types: BTreeSet::new(), has_too_many: false };
         read.follow(&self.inner);
         reads.push(read);
+        self.inner.note_reads(&reads);
         Ok(subscription)
     }
 
@@ -326,12 +328,40 @@ impl Inner {
         Some(self.adapter.keeping(topic, offered.depth))
     }
 
+    /// A reader of requests that is there to be seen, until others read.
+    fn idle_reader(
+        &self,
+        name: &RosName,
+        topic: &TopicName,
+        type_name: &str,
+    ) -> Option<Subscription> {
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, marked());
+        let options = SubscribeOptions { max_messages: 1, ..SubscribeOptions::default() };
+        let (sender, idle) = crate::port::subscription(options);
+        self.adapter.read(topic, sender, options).ok()?;
+        Some(idle)
+    }
+
+    /// Requests that wait in idle readers are read as soon as somebody reads them.
+    fn note_reads(&self, reads: &[Read]) {
+        let requests = reads.iter().filter(|read| read.name.carries == Carries::Requests);
+        let is_changed = self.services.lock().set_read(requests.map(|it| it.name.to_dds()));
+        if is_changed {
+            self.adapter.look_again();
+        }
+    }
+
     /// What takes time has its turn.
     fn tick(&self, now: Instant) {
         let offers: Vec<Arc<Offer>> =
             self.offers.lock().values().flatten().filter_map(Weak::upgrade).collect();
         offers.iter().for_each(|offer| offer.tick(self, now));
-        self.reads.lock().retain(|read| !read.sender.is_closed());
+        let mut reads = self.reads.lock();
+        let before = reads.len();
+        reads.retain(|read| !read.sender.is_closed());
+        if reads.len() != before {
+            self.note_reads(&reads);
+        }
     }
 
     /// Ends all subscriptions, also those that have no writers.

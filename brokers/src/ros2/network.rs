@@ -191,16 +191,25 @@ impl Knowledge {
 
     /// Whether an endpoint has been known for as long as RustDDS takes to serve it.
     pub(super) fn has_met(&self, now: Instant, id: &EndpointId) -> bool {
-        let state = self.state.lock();
-        let entry = state.endpoints.get(id);
-        entry.is_some_and(|entry| now.saturating_duration_since(entry.since) >= SERVED_AFTER)
+        self.known_for(now, id).is_some_and(|known_for| known_for >= SERVED_AFTER)
     }
 
-    /// Whether the first server that reads these requests is of Cyclone.
-    pub(super) fn is_served_by_cyclone(&self, dds_topic: &str) -> bool {
-        let servers = RosName::of_dds(dds_topic).map(|name| self.endpoints(&name, false));
-        let first = servers.as_ref().and_then(|servers| servers.iter().min_by_key(|it| it.id));
-        first.is_some_and(|server| server.vendor == Vendor::CycloneDds)
+    /// How long an endpoint has been known.
+    fn known_for(&self, now: Instant, id: &EndpointId) -> Option<Duration> {
+        let state = self.state.lock();
+        state.endpoints.get(id).map(|entry| now.saturating_duration_since(entry.since))
+    }
+
+    /// How long a server of a service has been known by its writer of replies.
+    pub(super) fn replies_for(&self, now: Instant, replies: &RosName) -> Option<Duration> {
+        let writers = self.endpoints(replies, true);
+        writers.iter().filter_map(|writer| self.known_for(now, &writer.id)).max()
+    }
+
+    /// Whose implementation the first server is that reads these requests.
+    pub(super) fn server(&self, requests: &RosName) -> Option<Vendor> {
+        let servers = self.endpoints(requests, false);
+        servers.iter().min_by_key(|server| server.id).map(|server| server.vendor)
     }
 
     /// Requests are forgotten whose clients or servers have gone.

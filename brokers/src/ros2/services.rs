@@ -10,8 +10,8 @@
 //! request beside the reply, Cyclone has 16 bytes before the CDR. Between flows there is neither:
 //! a reply names writer and number of the request.
 
-use std::collections::{BTreeMap, HashMap};
-use std::time::Instant;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::time::{Duration, Instant};
 
 use blaze_domain::WriterId;
 use bytes::{BufMut, Bytes, BytesMut};
@@ -27,6 +27,11 @@ use crate::dds::{EndpointId, Sample};
 const MAX_OF_CLIENT: usize = 1024;
 /// The same of all clients together.
 const MAX_REQUESTS: usize = 65_536;
+/// How long a reader of replies and the server's writer have to be known until the server has found
+/// the reader, too.
+const MEET_SERVER: Duration = Duration::from_millis(200);
+/// How long requests wait for that at most.
+const LONGEST_MEET: Duration = Duration::from_secs(5);
 /// Bytes of the encapsulation, and of what Cyclone puts before requests and replies: who asks, and
 /// the number of the request.
 const ENCAPSULATION: usize = 4;
@@ -51,6 +56,12 @@ pub(super) fn carries(dds_topic: &str) -> Carries {
         Some("rr/") => Carries::Replies,
         _ => Carries::Messages,
     }
+}
+
+/// As a request names the reader of its reply.
+pub(super) fn named(reader: EndpointId) -> SampleIdentity {
+    let writer_guid = GUID::from_bytes(reader);
+    SampleIdentity { writer_guid, sequence_number: SequenceNumber::UNKNOWN }
 }
 
 impl OnWire {
@@ -171,6 +182,14 @@ pub(super) struct Forwarded {
     pub(super) flow: String,
 }
 
+/// A reader of the flow that gets the replies of a service.
+struct ReplyReader {
+    id: EndpointId,
+    since: Instant,
+    /// The writer whose requests name it: those of another one may have the same numbers.
+    named_by: Option<EndpointId>,
+}
+
 /// The requests that wait for replies.
 #[derive(Default)]
 pub(super) struct Services {
@@ -184,6 +203,12 @@ pub(super) struct State {
     /// Written here for clients elsewhere: how the server knows them, and on which DDS topic.
     forwarded: ByRequest<(OnWire, String)>,
     by_wire: HashMap<OnWire, Forwarded>,
+    /// DDS topics whose requests somebody reads.
+    read: BTreeSet<String>,
+    /// Own readers of replies, by DDS topic.
+    readers: HashMap<String, ReplyReader>,
+    /// DDS topics whose requests wait until their replies can be read, and since when.
+    waiting: HashMap<String, Instant>,
     /// Requests that were given up because there were too many.
     given_up: u64,
     /// The last number given to a server that wants one before the CDR.
@@ -228,6 +253,63 @@ impl State {
         OnWire::Header(header)
     }
 
+    /// Takes over the DDS topics whose requests somebody reads. Returns whether they are others.
+    pub(super) fn set_read(&mut self, topics: impl Iterator<Item = String>) -> bool {
+        let read = topics.collect();
+        let before = std::mem::replace(&mut self.read, read);
+        before != self.read
+    }
+
+    /// Whether somebody reads the requests of a DDS topic. Until then they wait.
+    pub(super) fn is_read(&self, topic: &str) -> bool {
+        self.read.contains(topic)
+    }
+
+    /// An own reader of replies stands, or no longer.
+    pub(super) fn note_reader(&mut self, now: Instant, topic: &str, id: EndpointId, stands: bool) {
+        if stands {
+            let reader = ReplyReader { id, since: now, named_by: None };
+            self.readers.insert(topic.to_owned(), reader);
+        } else if self.readers.get(topic).is_some_and(|reader| reader.id == id) {
+            self.readers.remove(topic);
+        }
+    }
+
+    /// The own participant is another one: its readers have gone.
+    pub(super) fn forget_readers(&mut self) {
+        self.readers.clear();
+    }
+
+    /// Whether the replies to requests of a topic reach the own reader of `replies`, where its
+    /// writer has been known for some time; also after a while in which that did not come about.
+    pub(super) fn may_ask(
+        &mut self,
+        now: Instant,
+        topic: &str,
+        replies: &str,
+        known_for: Option<Duration>,
+    ) -> bool {
+        let reader = self.readers.get(replies);
+        let stands = reader.map(|reader| now.saturating_duration_since(reader.since));
+        if stands.min(known_for).is_some_and(|both| both >= MEET_SERVER) {
+            self.waiting.remove(topic);
+            return true;
+        }
+        let since = self.waiting.entry(topic.to_owned()).or_insert(now);
+        now.saturating_duration_since(*since) >= LONGEST_MEET
+    }
+
+    /// The own reader of `replies`, as requests of a writer name it: servers of Fast DDS then wait
+    /// until they have met it.
+    pub(super) fn reader_to_name(
+        &mut self,
+        replies: &str,
+        writer: EndpointId,
+    ) -> Option<EndpointId> {
+        let reader = self.readers.get_mut(replies)?;
+        (*reader.named_by.get_or_insert(writer) == writer).then_some(reader.id)
+    }
+
     /// A request was written here.
     pub(super) fn note_forwarded(&mut self, topic: &str, known_as: OnWire, of: Forwarded) {
         let gone = self.forwarded.insert(of.request, (known_as, topic.to_owned()));
@@ -251,6 +333,7 @@ impl State {
         is_served: impl Fn(&str) -> bool,
     ) {
         self.asked.retain(|(client, _), _| is_client(client));
+        self.waiting.retain(|topic, _| is_served(topic));
         let gone = self.forwarded.retain(|_, (_, topic)| is_served(topic));
         self.forget(gone);
     }
@@ -315,6 +398,29 @@ mod tests {
         state.retain(|_| true, |topic| topic != "rq/addRequest");
         assert_eq!(state.counts(), (0, 0), "the server has gone");
         assert_eq!(state.take_forwarded(&wire(1)), None);
+    }
+
+    #[test]
+    fn requests_wait_for_the_reader_of_their_replies_but_not_for_ever() {
+        const TOPICS: [&str; 2] = ["rq/addRequest", "rr/addReply"];
+        let (begin, mut state) = (Instant::now(), State::default());
+        let may_ask = |state: &mut State, ms: u64, known_ms: Option<u64>| {
+            let known_for = known_ms.map(Duration::from_millis);
+            state.may_ask(begin + Duration::from_millis(ms), TOPICS[0], TOPICS[1], known_for)
+        };
+        assert!(!may_ask(&mut state, 0, Some(900)), "there is no reader");
+        state.note_reader(begin, TOPICS[1], [1; 16], true);
+        assert!(!may_ask(&mut state, 199, Some(900)) && !may_ask(&mut state, 900, Some(199)));
+        assert!(!may_ask(&mut state, 900, None), "the server has no writer");
+        assert!(may_ask(&mut state, 5_000, None), "for so long");
+        assert!(may_ask(&mut state, 5_001, Some(200)));
+        assert!(!may_ask(&mut state, 6_000, None), "of another server");
+        state.note_reader(begin, TOPICS[1], [2; 16], false);
+        assert_eq!(state.reader_to_name(TOPICS[1], [8; 16]), Some([1; 16]));
+        assert_eq!(state.reader_to_name(TOPICS[1], [9; 16]), None, "numbers may be the same");
+        assert_eq!(state.reader_to_name(TOPICS[1], [8; 16]), Some([1; 16]));
+        state.note_reader(begin, TOPICS[1], [1; 16], false);
+        assert_eq!(state.reader_to_name(TOPICS[1], [8; 16]), None);
     }
 
     #[test]

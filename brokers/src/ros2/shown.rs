@@ -1,19 +1,21 @@
 //! Topics that show on the network though nobody there has asked for them: idle writers, so that
-//! `ros2 topic list` and rviz know them.
+//! `ros2 topic list` and rviz know them. Of a service's requests it is an idle reader, so that
+//! `ros2 service list` and clients do.
 //!
-//! An idle writer goes when the topic is written in its type, after the one that is used stands.
+//! An idle writer goes when the topic is written in its type, after the one that is used stands. An
+//! idle reader stays: requests wait in it until somebody reads them.
 
 use std::collections::BTreeMap;
 
 use blaze_domain::TopicName;
 
-use super::names::RosName;
+use super::names::{Carries, RosName};
 use super::offers::{Offer, Offered};
 use super::{Inner, MAX_SHOWN};
 use crate::dds::adapter::TopicPublisher;
-use crate::port::PublisherOptions;
+use crate::port::{PublisherOptions, Subscription};
 
-/// What shows of a topic.
+/// What shows of a topic, or of a half of a service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Shown {
     /// ROS type, such as `sensor_msgs/msg/Imu`.
@@ -29,6 +31,8 @@ struct Idle {
     shown: Shown,
     /// What its writer offers, if there is one.
     writer: Option<(Offered, TopicPublisher)>,
+    /// Of requests.
+    reader: Option<Subscription>,
 }
 
 /// All topics that are to show.
@@ -50,11 +54,11 @@ impl AllShown {
         if self.by_name.len() >= MAX_SHOWN && !self.by_name.contains_key(&name) {
             return false;
         }
-        self.by_name.insert(name, Idle { topic, shown, writer: None });
+        self.by_name.insert(name, Idle { topic, shown, writer: None, reader: None });
         true
     }
 
-    /// Makes the idle writer of a topic, or one that offers what readers ask for now; ends the one
+    /// Makes the idle reader or writer of a topic, or one that offers what readers ask for now; ends the one
     /// that is not needed beside those of `offers`.
     pub(super) fn follow<'a>(
         &mut self,
@@ -62,7 +66,14 @@ impl AllShown {
         name: &RosName,
         mut offers: impl Iterator<Item = &'a Offer>,
     ) {
-        let Some(Idle { topic, shown, writer }) = self.by_name.get_mut(name) else { return };
+        let Some(idle) = self.by_name.get_mut(name) else { return };
+        let Idle { topic, shown, writer, reader } = idle;
+        if name.carries == Carries::Requests {
+            if reader.is_none() {
+                *reader = inner.idle_reader(name, topic, &shown.type_name);
+            }
+            return;
+        }
         if offers.any(|offer| offer.writes(&shown.type_name)) {
             *writer = None;
             return;

@@ -18,7 +18,9 @@ use blaze_domain::{Durability, FlowId, LayerName, Reliability, Scope, TopicName,
 
 use super::told::merge_offers;
 use super::{Survey, rendezvous};
-use crate::world::{Advertise, FlowView, Reach, Ros2Network, Ros2NetworkId, TopicEntry, World};
+use crate::world::{
+    Advertise, FlowView, Reach, Request, Ros2Network, Ros2NetworkId, ScopeEntry, TopicEntry, World,
+};
 
 /// The flows of a layer on one ROS 2 network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -110,7 +112,10 @@ pub struct Shown {
 pub(crate) fn shown(survey: &Survey<'_>, topic: &TopicName) -> Option<Shown> {
     let world = survey.world;
     let (me, own) = world.flows.get_key_value(&world.me)?;
-    let network = Network::of(me, own).filter(|_| world.carries(me) && !is_of_service(topic))?;
+    let network = Network::of(me, own).filter(|_| world.carries(me))?;
+    if is_of_service(topic) {
+        return shown_server(survey, network, topic);
+    }
     let is_own = |id: &FlowId, scope| id == me && scope == Scope::Node;
     let writes_others = || writer(&survey.networks, network, topic) == Some(me);
     // What flows of the network offer on their nodes, each of them shows itself.
@@ -129,6 +134,30 @@ pub(crate) fn shown(survey: &Survey<'_>, topic: &TopicName) -> Option<Shown> {
     let offer = merge_offers(shown.map(|(.., offer)| offer))?;
     let Advertise { type_name, reliability, durability, .. } = offer;
     (!type_name.is_empty()).then_some(Shown { type_name, reliability, durability })
+}
+
+/// What shows of a server elsewhere: that it reads requests, or writes replies. Each flow of a
+/// network shows it, as each takes the requests of its own clients; none does where the network has
+/// a server of its own.
+fn shown_server(survey: &Survey<'_>, network: Network<'_>, topic: &TopicName) -> Option<Shown> {
+    let of = |entry: &ScopeEntry| {
+        if is_request(topic) {
+            let Request { type_name, reliability, durability, .. } = entry.request.clone()?;
+            return Some(Shown { type_name, reliability, durability });
+        }
+        let Advertise { type_name, reliability, durability, .. } = entry.advertise.clone()?;
+        Some(Shown { type_name, reliability, durability })
+    };
+    let mut shown = None;
+    for (id, flow) in survey.holders(topic).into_iter().filter(|(id, _)| survey.world.carries(id)) {
+        let Some(entry) = flow.topics.get(topic) else { continue };
+        let of_ros2 = flow.ros2.and_then(|_| of(&entry.ros2));
+        if of_ros2.is_some() && Network::of(id, flow) == Some(network) {
+            return None;
+        }
+        shown = shown.or(of_ros2).or_else(|| of(&entry.layer));
+    }
+    shown.filter(|shown| !shown.type_name.is_empty())
 }
 
 /// The flows whose networks have a server of a service, sorted; a client that one of these is on

@@ -125,7 +125,7 @@ impl Lifecycle {
             generation.forget_writer(&self.shared, writer.id());
         }
         for channel in self.shared.channels.take_unused() {
-            generation.forget_channel(&channel);
+            generation.forget_channel(&self.shared, &channel);
         }
         let others = generation.presence.lock().count();
         let detail = format!(
@@ -233,7 +233,7 @@ fn make_missing(shared: &Arc<Shared>, generation: &mut Generation, until: Instan
             break;
         }
         let offered = shared.offered.read().get(&*channel.topic.name).copied().unwrap_or_default();
-        refused = generation.open(&channel, channel.wanted(offered)).err().or(refused);
+        refused = generation.open(shared, &channel, channel.wanted(offered)).err().or(refused);
     }
     // The next may be made all the same.
     if let Some(error) = refused {

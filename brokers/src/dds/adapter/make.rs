@@ -117,7 +117,12 @@ impl Generation {
     }
 
     /// Makes the readers of a channel that are missing, as far as RustDDS makes them.
-    pub(super) fn open(&mut self, channel: &Channel, wanted: [bool; 3]) -> Result<(), DdsError> {
+    pub(super) fn open(
+        &mut self,
+        shared: &Shared,
+        channel: &Channel,
+        wanted: [bool; 3],
+    ) -> Result<(), DdsError> {
         let topic = (&*channel.topic.name, &*channel.topic.type_name);
         let mut readers = channel.readers.lock();
         let Readers { by_kind, opened, .. } = &mut *readers;
@@ -131,8 +136,12 @@ impl Generation {
             let begin = Timestamp::now();
             match self.participant.raw_reader(topic, channel.profile(kind)) {
                 Ok(made) => {
-                    self.readers.insert(endpoint_of(made.guid()));
+                    let id = endpoint_of(made.guid());
+                    self.readers.insert(id);
                     self.changes += 1;
+                    if kind == Kind::Reliable {
+                        shared.dialect.note_reader(&channel.topic, id, true);
+                    }
                     *reader = Some(made);
                     opened.get_or_insert(begin);
                 }
@@ -147,9 +156,11 @@ impl Generation {
     }
 
     /// A channel has gone.
-    pub(super) fn forget_channel(&mut self, channel: &Channel) {
+    pub(super) fn forget_channel(&mut self, shared: &Shared, channel: &Channel) {
         for reader in channel.readers.lock().by_kind.iter().flatten() {
-            self.readers.remove(&endpoint_of(reader.guid()));
+            let id = endpoint_of(reader.guid());
+            shared.dialect.note_reader(&channel.topic, id, false);
+            self.readers.remove(&id);
             self.changes += 1;
         }
     }

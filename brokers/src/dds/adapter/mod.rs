@@ -132,6 +132,10 @@ pub(crate) trait Dialect: Send + Sync + 'static {
     /// All readers and writers that others have.
     fn note_endpoints(&self, endpoints: &Endpoints);
 
+    /// A reader of a topic that meets reliable writers stands, or no longer. All have gone with
+    /// their participant when there is a new [companion](Self::companion).
+    fn note_reader(&self, _topic: &Topic, _reader: EndpointId, _stands: bool) {}
+
     /// Whether samples of a writer are read as a topic's. It may not have been found yet.
     fn admission(&self, _topic: &Topic, _writer: &EndpointId) -> Admission {
         Admission::Yes

@@ -181,6 +181,42 @@ fn what_others_offer_in_a_type_shows_on_the_network_once() {
 }
 
 #[test]
+fn a_server_elsewhere_shows_where_there_is_none() {
+    let shown = |lines: &[&str], name: &str| -> Vec<FlowId> {
+        let mut world = world(lines);
+        for line in lines {
+            let flow = line.split([' ', '@']).next().unwrap();
+            if line.contains("ros2-") {
+                ask(&mut world, flow, "ros2").type_name = "p/srv/T_Request".to_owned();
+            }
+            if line.contains("ros2+") {
+                offer(&mut world, flow, "ros2").type_name = "p/srv/T_Response".to_owned();
+            }
+        }
+        let world = renamed(&world, name);
+        let shows = |me: &&FlowId| {
+            let world = World { me: (*me).clone(), ..world.clone() };
+            network::shown(&Survey::new(&world), &name.parse().unwrap()).is_some()
+        };
+        world.flows.keys().filter(shows).cloned().collect()
+    };
+    let both = [id("e/a"), id("e/b")];
+    for (name, server, client) in
+        [("add/_request", "ros2-", "ros2+"), ("add/_reply", "ros2+", "ros2-")]
+    {
+        let at_server = format!("c/b net2 {server}");
+        let clients = [format!("e/a@1 net1 {client}"), "e/b@1 net1".to_owned()];
+        let lines = [&*at_server, &*clients[0], &*clients[1]];
+        assert_eq!(shown(&lines, name), both, "{name}");
+        let own = format!("e/b@1 net1 {server}");
+        assert_eq!(shown(&[&*at_server, "e/a@1 net1", &*own], name), [], "it has one: {name}");
+        assert_eq!(shown(&lines[1..], name), [], "a client alone: {name}");
+        let down = format!("{at_server} down");
+        assert_eq!(shown(&[&*down, "e/a@1 net1"], name), [], "its flow has gone: {name}");
+    }
+}
+
+#[test]
 fn a_message_meets_readers_of_its_type_alone() {
     for (hashes, connected) in
         [(["", ""], true), (["h1", ""], true), (["h1", "h1"], true), (["h1", "h2"], false)]

@@ -1,21 +1,23 @@
 //! The adapter of ROS 2, with participants on RustDDS in the place of nodes.
 
 use std::net::Ipv4Addr;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    Cdr, EndpointId, Participant, ParticipantConfig, Profile, Reader, Terms, Writer, Written,
+    Cdr, EndpointId, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer,
+    Written,
 };
-use blaze_brokers::ros2::{GidLength, Network, Ros2Broker, Ros2Config};
+use blaze_brokers::ros2::{GidLength, Network, Ros2Broker, Ros2Config, Shown};
 use blaze_brokers::{
     Broker, Content, Health, PublisherOptions, Received, SubscribeOptions, Subscription,
 };
-use blaze_domain::{Origin, WriterId};
+use blaze_domain::{Origin, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
 use blaze_tests::flow::free_domain;
 use parking_lot::Mutex;
-use rustdds::{Timestamp, WriteOptionsBuilder};
+use rustdds::{SampleIdentity, Timestamp, WriteOptionsBuilder};
 
 use super::support::{DEADLINE, WITH_KEPT, eventually, wait_for};
 
@@ -414,4 +416,76 @@ async fn a_subscription_without_writers_ends_with_the_broker() {
         let end = subscription.receive(&mut none, usize::MAX);
         assert_eq!(tokio::time::timeout(DEADLINE, end).await, Ok(0));
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn requests_wait_until_their_replies_can_be_read() {
+    const CLIENTS: u8 = 16;
+    let net = Net::start().await;
+    let node = net.node();
+    // The server answers at once, and cannot before it has met a reader.
+    let (answers, executed) = (Arc::<OnceLock<Writer>>::default(), Arc::<AtomicUsize>::default());
+    let (writes, count) = (Arc::clone(&answers), Arc::clone(&executed));
+    let serve = move |sample: Sample| {
+        count.fetch_add(1, Ordering::Relaxed);
+        let (writer_guid, sequence_number) = (sample.writer_guid, sample.sequence_number);
+        let related = SampleIdentity { writer_guid, sequence_number };
+        let options = WriteOptionsBuilder::new().related_sample_identity(related);
+        let reply = sample.sample.payload().clone();
+        writes.get().map(|writer| writer.write_cdr(Cdr::little(reply).unwrap(), options));
+        true
+    };
+    let _server =
+        node.typed_reader(("rq/addRequest", TYPE), reliable(64), Box::new(serve)).unwrap();
+    net.network("the server", |network| network.endpoints.len() == 1).await;
+    let requests = net.broker.publisher(&"add/_request".parse().unwrap(), RELIABLE).unwrap();
+    for client in 1..=CLIENTS {
+        requests.publish(&frame("add/_request", client, client), None);
+    }
+    // Its other half comes late, and so does the flow's.
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    let writer = node.typed_writer(("rr/addReply", TYPE), reliable(64)).unwrap();
+    net.own(&[writer.id()]).await;
+    answers.set(writer).ok().unwrap();
+    let mut subscription = net.read("add/_reply", SubscribeOptions::default()).await;
+    let mut replies = Vec::new();
+    let read = async {
+        while replies.len() < CLIENTS.into() {
+            assert!(subscription.receive(&mut replies, usize::MAX).await > 0);
+        }
+    };
+    let waited = tokio::time::timeout(DEADLINE, read).await;
+    let executed = executed.load(Ordering::Relaxed);
+    assert!(waited.is_ok(), "{} replies to {executed} requests", replies.len());
+    assert_eq!(executed, usize::from(CLIENTS));
+    for reply in &replies {
+        let Content::Frame(frame) = &reply.content else { panic!("{:?}", reply.content) };
+        let client = number(reply);
+        assert_eq!(frame.related(), Some((WriterId([client; 16]), client.into())));
+    }
+    assert_eq!(net.broker.requests(), (0, 0));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_request_to_a_server_that_only_shows_waits_until_somebody_reads_it() {
+    let net = Net::start().await;
+    let node = net.node();
+    let topic: TopicName = "add/_request".parse().unwrap();
+    let type_name = "std_msgs/msg/UInt8".to_owned();
+    let shown = Shown { type_name, reliable: true, durable: false };
+    assert_eq!(net.broker.show([(topic.clone(), Some(shown))]), 0);
+    let client = node.typed_writer(("rq/addRequest", TYPE), reliable(8)).unwrap();
+    net.own(&[client.id()]).await;
+    eventually("matched", || client.is_matched().then_some(())).await;
+    put(&client, 1);
+    eventually("acknowledged", || client.is_acknowledged().then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let mut subscription = net.read("add/_request", SubscribeOptions::default()).await;
+    assert_eq!(until(&mut subscription, 1).await, [1]);
+    put(&client, 2);
+    assert_eq!(until(&mut subscription, 2).await, [2]);
+    drop(subscription);
+    assert!(client.is_matched(), "it shows still");
+    net.broker.show([(topic, None)]);
+    eventually("it has gone", || (!client.is_matched()).then_some(())).await;
 }

@@ -6,4 +6,5 @@ mod graph;
 mod long;
 mod quality;
 mod routes;
+mod services;
 mod support;
