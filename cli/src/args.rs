@@ -10,7 +10,7 @@ use crate::admin::TopOptions;
 use crate::config::ConfigCommand;
 use crate::demo::options::DemoOptions;
 use crate::dev::options::DevOptions;
-use crate::local::{EchoOptions, HzOptions, PublishOptions};
+use crate::local::{CallOptions, EchoOptions, HzOptions, PublishOptions};
 use crate::output::Output;
 use crate::plan::PlanOptions;
 
@@ -55,6 +55,8 @@ pub enum Command {
     Echo(EchoOptions),
     /// The rate at which a topic arrives, once a second
     Hz(HzOptions),
+    /// Call a ROS 2 service, through the flow on the local broker
+    Call(CallOptions),
     /// Robot, fog and cloud in one process, with recorded data
     Demo(DemoOptions),
     /// Main service, worker, flow and broker of one node in one process, for developing services:

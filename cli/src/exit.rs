@@ -3,6 +3,7 @@
 use std::fmt;
 use std::process::ExitCode;
 
+use blaze_domain::control::{ControlError, ErrorCode};
 use serde_json::{Value, json};
 
 use crate::config::Refusal;
@@ -142,6 +143,10 @@ pub enum CliError {
         /// What the system or the deadline said.
         reason: String,
     },
+    /// A called service has not replied.
+    #[error("{}{}: {}", .0.code,
+        if .0.pointer.is_empty() { String::new() } else { format!(" at {}", .0.pointer) }, .0.detail)]
+    Call(Box<ControlError>),
     /// `diff` could not compare.
     #[error("{0}")]
     Diff(Box<CliError>),
@@ -181,6 +186,11 @@ impl CliError {
             Self::Refused { status, .. } => Exit::of_status(*status),
             Self::Problem(refusal) => refusal.exit(),
             Self::NoServer { .. } => Exit::CannotConnect,
+            Self::Call(error) => match error.code {
+                ErrorCode::NoServer => Exit::NotFound,
+                ErrorCode::ConvertError => Exit::Invalid,
+                _ => Exit::Failed,
+            },
             Self::Diff(inner) => match inner.exit() {
                 Exit::Failed => Exit::DiffFailed,
                 exit => exit,
@@ -220,6 +230,7 @@ impl CliError {
             Self::OutcomeUnknown { .. } => {
                 ("outcome_unknown", "Whether the change took effect is not known.")
             }
+            Self::Call(error) => (error.code.as_str(), "The called service has not replied."),
             Self::Failed(_) | Self::OutputClosed => ("failed", "It was tried and failed."),
         };
         let applied = match self {

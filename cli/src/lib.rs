@@ -4,7 +4,7 @@
 //! args ──► admin: topics, bridges, peers, top, why ──► http ──► admin port of a flow ──► output
 //!      ├─► plan: plan file ──► allocator of the data plane ──► output
 //!      ├─► config: get, apply, watch, … ──► REST of the main service of BlazeConfig ──► output
-//!      ├─► local: pub, echo, hz ──► ServiceManager ──► local broker of the node file
+//!      ├─► local: pub, echo, hz, call ──► local broker of the node file
 //!      ├─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
 //!      └─► dev: main service, worker and flow of one node in one process
 //! ```
@@ -74,6 +74,7 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
         Command::Pub(options) => local::publish(options, format?).await,
         Command::Echo(options) => local::echo(options, format?).await,
         Command::Hz(options) => local::hz(options, format?).await,
+        Command::Call(options) => local::call(options, format?).await,
         Command::Demo(options) => demo::run(options, format?).await,
         Command::Dev(options) => dev::run(*options, format?).await,
         Command::Config(command) => config::run(*command, output).await,

@@ -15,6 +15,7 @@ node is a DDS participant of its own. Names of endpoints are the caller's, uniqu
   matched       name                                       -> count       of the other side
   destroy       name                                       -> {}          an endpoint, or a node with all of its own
   server        name, node, service, type                  -> {}          the reply has the request's fields of equal name
+      only rclpy: reply (fields that it always has), delay_ms (before each reply)
   client        name, node, service, type                  -> {}
   available     name                                       -> ready       a server of that client, or an action client
   call          name, request, timeout_ms                  -> reply

@@ -108,12 +108,13 @@ class Ros2Peer(peer.Peer):
 
     # --- services and actions ---
 
-    def op_server(self, name, node, service, type) -> dict:
+    def op_server(self, name, node, service, type, reply=None, delay_ms=0) -> dict:
         end, node = self.end(name, node, type)
 
         def serve(request, response):
             end.count += 1
-            return peer.echo(request, response)
+            time.sleep(delay_ms / 1e3)
+            return peer.with_fields(peer.echo(request, response), reply or {})
 
         server = node.create_service(peer.found(type), service, serve)
         end.destroy = lambda: node.destroy_service(server)

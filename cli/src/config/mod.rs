@@ -41,7 +41,7 @@ mod stream;
 #[cfg(test)]
 mod stub;
 mod tables;
-mod text;
+pub(crate) mod text;
 mod tls;
 mod token;
 mod token_local;

@@ -1,9 +1,12 @@
-//! `blaze pub`, `echo` and `hz`: the command line as a service on the local broker of a node file.
+//! `blaze pub`, `echo`, `hz` and `call`: the command line as a service on the local broker of a node
+//! file.
 //!
 //! ```text
-//! node file ─► broker of the node scope, else of the layer scope ─► ServiceManager ─► publish, subscribe
+//! node file ─► broker of the node scope, else of the layer scope ─┬► ServiceManager ─► publish, subscribe
+//!                                                                 └► call ─► control message, answer
 //! ```
 
+mod call;
 mod echo;
 mod hz;
 mod publish;
@@ -26,6 +29,7 @@ use crate::args::parse_topic;
 use crate::exit::CliError;
 use crate::node_file;
 
+pub use call::{CallOptions, run as call};
 pub use echo::{EchoOptions, run as echo};
 pub use hz::{HzOptions, run as hz};
 pub use publish::{PublishOptions, run as publish};

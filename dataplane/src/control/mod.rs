@@ -10,6 +10,7 @@
 //! carries it out with tasks and brokers, the simulated network with plain calls.
 
 mod balance;
+mod calls;
 mod carrying;
 mod gateways;
 mod info;
@@ -37,6 +38,7 @@ use crate::types::ConvertFailure;
 use crate::world::{FlowState, OriginFilter, Reach, World};
 use balance::Balance;
 pub use balance::{LastMove, MoveReason, Moves, STAY};
+use calls::Calls;
 use carrying::Carriers;
 pub use carrying::Duty;
 use gateways::Gateways;
@@ -74,6 +76,7 @@ pub struct ControlCore {
     durable: BTreeMap<TopicName, BTreeSet<OriginFilter>>,
     replicas: Replicas,
     ros2: Ros2,
+    calls: Calls,
     gateways: Gateways,
     carriers: Carriers,
     balance: Balance,
@@ -112,6 +115,7 @@ impl ControlCore {
             carriers: Carriers::default(),
             balance: Balance::default(),
             ros2: Ros2::default(),
+            calls: Calls::default(),
             config,
             registry,
             plans: BTreeMap::new(),
@@ -222,6 +226,9 @@ impl ControlCore {
             self.tell(event, wall_ms);
         }
         self.touch(now, outcome.changed);
+        for call in outcome.calls {
+            self.call(now, call);
+        }
     }
 
     /// Takes what the link says of other flows.
@@ -300,6 +307,7 @@ impl ControlCore {
             self.touch_all(now);
         }
         self.take_back_late(now, wall_ms);
+        self.follow_calls(now);
         self.plan_due(now, wall_ms);
         for (to, body) in self.registry.poll(now) {
             self.outputs.push_back(Output::Link { to, body: Box::new(body) });

@@ -6,6 +6,7 @@ use std::time::Instant;
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::{AccessRules, AutoBool};
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName, WriterId};
+use blaze_proto::Frame;
 use blaze_proto::link::link_control::{Body, LayerScope};
 use bytes::Bytes;
 
@@ -36,6 +37,11 @@ pub enum Output {
         to: FlowId,
         /// The message.
         body: Box<Body>,
+    },
+    /// Send a request of this flow to a service, and give its reply to [`ControlCore::call_reply`].
+    Call {
+        /// The request.
+        request: Frame,
     },
     /// Make the bridges of a topic equal to this plan.
     Plan {

@@ -1,6 +1,7 @@
 //! The control core as a flow with real brokers drives it.
 
 mod balance;
+mod calls;
 mod gateways;
 mod replicas;
 mod ros2;

@@ -1,7 +1,7 @@
 //! The task that drives the control core: control channels and link news in, answers, plans and
 //! registry messages out.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -20,7 +20,8 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::Shared;
-use super::plane::{News, wall_ms};
+use super::plane::{News, wall_ms, wall_ns};
+use super::routes::SourceState;
 use crate::control::{Duty, Output};
 use crate::registry::peers_channel;
 use crate::world::FlowState;
@@ -159,7 +160,9 @@ impl ControlTask {
             }
         }
         self.report_failures();
+        self.follow_calls();
         self.carry_out_all(now);
+        self.send_calls(now);
         self.empty(now);
         self.shared.allocate(now);
         for (topic, writer) in self.shared.plane.with(|state| state.core.take_superseded()) {
@@ -175,6 +178,37 @@ impl ControlTask {
         for (topic, failure) in failures {
             self.shared.control.lock().convert_failed(wall_ms(), topic, failure);
         }
+    }
+
+    /// Gives the control core the replies to calls that have arrived.
+    fn follow_calls(&self) {
+        let arrived = self.shared.plane.read(|state| state.core.take_arrived());
+        for reply in arrived {
+            self.shared.control.lock().call_reply(&reply);
+        }
+    }
+
+    /// Sends the calls whose ways stand: their plans are carried out.
+    fn send_calls(&mut self, now: Instant) {
+        let awaited = self.shared.control.lock().awaited_replies();
+        if awaited.is_empty() {
+            return;
+        }
+        let is_read = |topic: &TopicName| {
+            let reads = self.shared.plane.read(|state| {
+                let id = state.core.find(topic.as_str())?;
+                let path = state.core.path(id);
+                Some((id, Scope::LOCAL.map(|scope| (scope, path.reads(scope)))))
+            });
+            reads.is_some_and(|(id, reads)| {
+                reads.into_iter().filter(|(_, reads)| *reads).all(|(scope, _)| {
+                    self.shared.routes.source_state(id, scope) == SourceState::Subscribed
+                })
+            })
+        };
+        let read: BTreeSet<TopicName> = awaited.into_iter().filter(is_read).collect();
+        self.shared.control.lock().send_calls(now, wall_ns(), |topic| read.contains(topic));
+        self.carry_out_all(now);
     }
 
     /// Tells the control core once a second what this flow carries.
@@ -231,6 +265,9 @@ impl ControlTask {
                 if let Some(inter) = &self.shared.inter {
                     inter.want(join);
                 }
+            }
+            Output::Call { request } => {
+                plane.with(|state| state.send_call(now, wall_ns(), request));
             }
             Output::Plan { topic, plan, info, duty } => {
                 let places = self.shared.routes.apply(&topic, &plan, *info, &duty);

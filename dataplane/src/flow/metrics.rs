@@ -56,6 +56,7 @@ gauge blaze_flow_peer_up peer 1 while the peer says Hello and acknowledges.
 gauge blaze_flow_peer_rtt_seconds peer Round trip to the peer.
 gauge blaze_ros2_endpoints kind,state Endpoints of the ROS 2 network.
 gauge blaze_ros2_participants - Participants of the ROS 2 network that have endpoints.
+counter blaze_ros2_calls_total outcome Calls of ROS 2 services, as they were answered.
 gauge blaze_flow_leases kind Leases of local services.
 counter blaze_flow_link_events_total event Things that happened on the link.
 gauge blaze_flow_load_bytes_per_second direction Payload that the flow carries over the inter scope, \
@@ -356,6 +357,9 @@ impl Page {
     }
 
     fn fill_ros2(&self, shared: &Shared) {
+        for (outcome, count) in shared.control.lock().call_outcomes() {
+            self.add("blaze_ros2_calls_total", &[outcome], *count as f64);
+        }
         let Some(ros2) = &shared.ros2 else { return };
         for row in rows(&ros2.seen(), &shared.control.lock()) {
             self.add("blaze_ros2_endpoints", &[row.kind, row.state], 1.0);

@@ -6,6 +6,7 @@
 //! | control task | control channels, link news → control core → answers, plans | 1 |
 //! | scope task | health of a local broker, the leases that it keeps → control core | per local scope |
 //! | network task | endpoints of a ROS 2 network → control core | 1 where there is one |
+//! | calls task | replies of servers on a ROS 2 network → JSON for calls → message path | 1 where there is one |
 //! | peers task | who else uses the layer broker, and what they say | 1 where there is one |
 //! | source task | one topic of one local scope → message path | per topic and scope that is read |
 //! | inter thread | joins and leaves the inter scope, as the control core wants | 1 where there is one |
@@ -18,6 +19,7 @@
 
 mod admin;
 mod allocation;
+mod calls;
 mod control_task;
 mod epochs;
 mod health;
@@ -321,6 +323,8 @@ pub async fn start_with(
     if shared.ros2.is_some() {
         let follow = ros2::follow_network(Arc::clone(&shared), supervisor.shutdown_token());
         supervisor.spawn("network", TaskPolicy::Essential, follow);
+        let answer = calls::answer_calls(Arc::clone(&shared), supervisor.shutdown_token());
+        supervisor.spawn("calls", TaskPolicy::Essential, answer);
     }
     supervisor.spawn(
         "health",

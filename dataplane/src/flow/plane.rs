@@ -13,6 +13,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
 use blaze_domain::Scope;
+use blaze_proto::Frame;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
 
@@ -92,6 +93,16 @@ impl PlaneState {
         batch: &mut Vec<Received>,
     ) {
         self.core.ingest(now, wall_ns, topic, from, batch, &mut self.engine);
+    }
+
+    /// Sends a request of this flow to a service.
+    pub fn send_call(&mut self, now: Instant, wall_ns: u64, request: Frame) {
+        self.core.send_call(now, wall_ns, request, &mut self.engine);
+    }
+
+    /// Sends the reply of an own server to the flow of the call.
+    pub fn answer_call(&mut self, now: Instant, reply: Frame) {
+        self.core.answer_call(now, reply, &mut self.engine);
     }
 
     /// A pool thread takes the next job.
@@ -180,6 +191,8 @@ pub struct Plane {
     news: Mutex<VecDeque<News>>,
     news_dropped: AtomicU64,
     news_waits: Notify,
+    /// The task that answers calls waits here.
+    calls_wait: Notify,
 }
 
 impl Plane {
@@ -194,6 +207,7 @@ impl Plane {
             news: Mutex::default(),
             news_dropped: AtomicU64::new(0),
             news_waits: Notify::new(),
+            calls_wait: Notify::new(),
         })
     }
 
@@ -221,6 +235,7 @@ impl Plane {
                 told = true;
                 self.tell(event);
             });
+            told |= self.tell_calls(&state);
             (result, told, state.core.take_pool_requests())
         };
         self.work.notify_one();
@@ -368,6 +383,7 @@ impl Plane {
             state.pump(now, &mut tell);
             let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
             state.pump(now, &mut tell);
+            told |= self.tell_calls(&state);
             let paced = state.engine.as_ref().and_then(Engine::paced_until);
             if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_pool_requests() {
                 let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
@@ -395,6 +411,20 @@ impl Plane {
     /// What the link has to say to the control core since the last call.
     pub fn take_news(&self) -> Vec<News> {
         self.news.lock().drain(..).collect()
+    }
+
+    /// Whether replies to calls have arrived; answers of own servers go to their task.
+    fn tell_calls(&self, state: &PlaneState) -> bool {
+        let (has_arrived, has_answers) = state.core.call_news();
+        if has_answers {
+            self.calls_wait.notify_one();
+        }
+        has_arrived
+    }
+
+    /// Waits until own servers have answered calls.
+    pub async fn call_answers(&self) {
+        self.calls_wait.notified().await;
     }
 
     /// Waits until there is something for [`Plane::take_news`].

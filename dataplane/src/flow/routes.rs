@@ -5,10 +5,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Begin, Broker, BrokerError, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{
+    Begin, Broker, BrokerError, Later, PublishOutcome, Publisher, PublisherOptions,
+    SubscribeOptions,
+};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName};
+use blaze_proto::Frame;
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
+use bytes::Bytes;
 use parking_lot::Mutex;
 
 use super::plane::Plane;
@@ -204,7 +209,15 @@ impl Routes {
         if let Some(held) = held.filter(keeps) {
             return Ok(held);
         }
-        let broker = self.brokers.of(bridge.to.scope()).ok_or("the scope has no broker")?;
+        let scope = bridge.to.scope();
+        let broker = match self.brokers.of(scope) {
+            Some(broker) => broker,
+            // Replies to calls are taken out before: what still comes is too late for everybody.
+            None if scope == Scope::Node => {
+                return Ok(NewWriter { publisher: Arc::new(Nowhere), options });
+            }
+            None => return Err("the scope has no broker".to_owned()),
+        };
         let publisher = broker
             .publisher(&channel, options)
             .map_err(|error| format!("{topic} cannot be written: {error}"))?;
@@ -261,6 +274,23 @@ impl Routes {
         let task = self.supervisor.spawn(name, TaskPolicy::Essential, source.run());
         let source = Source { task, state, large, with_kept };
         sources.insert((id, scope), source);
+    }
+}
+
+/// The writer of a node scope without a broker.
+struct Nowhere;
+
+impl Publisher for Nowhere {
+    fn publish(&self, _: &Frame, _: Option<Instant>) -> PublishOutcome {
+        PublishOutcome::Dropped
+    }
+
+    fn publish_bare(&self, _: &Bytes, _: Option<Instant>) -> PublishOutcome {
+        PublishOutcome::Dropped
+    }
+
+    fn later(&self) -> Later {
+        Later::default()
     }
 }
 

@@ -23,6 +23,7 @@ use lru::LruCache;
 use super::admit::{Admitted, Refusal};
 use super::allocation::Reckoned;
 use super::bridge::Passed;
+use super::calls::Calls;
 use super::compress_stage::{Arrival, CompressStage, ToBrokers, ToLanes};
 use super::early::Early;
 use super::kept::KeptMessages;
@@ -140,6 +141,8 @@ pub struct DataCore {
     pub(super) kept: KeptMessages,
     /// Compression, decompression and conversion.
     pub(super) compress: CompressStage,
+    /// Calls of ROS 2 services.
+    pub(super) calls: Calls,
     /// Types of ROS 2 for conversions.
     pub(super) types: Arc<Types>,
     /// Messages that could not be converted, for events.
@@ -181,6 +184,7 @@ impl DataCore {
             succession: Succession::default(),
             kept: KeptMessages::default(),
             compress: CompressStage::default(),
+            calls: Calls::default(),
             types: Arc::default(),
             convert_failures: Vec::new(),
             begun: Vec::new(),
@@ -448,6 +452,9 @@ impl DataCore {
         message: &Admitted,
         link: &mut dyn LaneLink,
     ) {
+        if self.take_reply(from, message) {
+            return;
+        }
         self.kept.keep(now, topic, from, message);
         let me = &self.config.me;
         let path = &mut self.topics[topic.0 as usize];
@@ -482,6 +489,9 @@ impl DataCore {
         }
         if !lanes.is_empty() {
             self.compress_out(now, topic, &message.frame, lanes, Arrival::Live, link);
+        }
+        if !as_cdr.is_empty() {
+            self.calls.note_served(&message.frame);
         }
         for (to, bridges) in [(Encoding::Json, as_json), (Encoding::Cdr, as_cdr)] {
             if !bridges.is_empty() {

@@ -3,6 +3,7 @@
 mod admit;
 pub mod allocation;
 mod bridge;
+pub mod calls;
 pub mod compress_stage;
 pub mod core;
 mod early;

@@ -12,6 +12,7 @@
 
 mod access;
 mod announce;
+mod callers;
 mod found;
 mod gateways;
 mod holder;
@@ -34,14 +35,15 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
 use blaze_domain::control::{
-    Answer, ControlError, ControlMessage, ErrorCode, EventKind, LeaseKind, ParsedObject,
-    parse_payload,
+    AdvertiseMessage, Answer, CallMessage, Common, ControlError, ControlMessage, ErrorCode,
+    EventKind, LeaseKind, ParsedObject, parse_payload,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Durability, FlowId, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, RouteState};
 
 use announce::{Announcer, MAX_LEASED_ENTRIES};
+use callers::Callers;
 use found::Found;
 pub use found::FoundEndpoint;
 use leases::LeaseTable;
@@ -62,7 +64,8 @@ use replicas::Hearing;
 pub use replicas::SILENT;
 pub use stored::{Restored, UnsavedLease};
 pub use types::{
-    AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults,
+    AnswerOut, CallIn, CalledTopics, Changes, ControlOutcome, EventDraft, RegistryConfig,
+    RemoteLease, SyncFaults,
 };
 pub(crate) use wire::MAX_ROUTES;
 
@@ -118,6 +121,8 @@ pub struct Registry {
     off: BTreeSet<Scope>,
     /// What the adapter of the ROS 2 network has found.
     found: Found,
+    /// Who calls ROS 2 services through this flow.
+    callers: Callers,
 }
 
 impl Registry {
@@ -138,6 +143,7 @@ impl Registry {
             on_layer: BTreeSet::new(),
             off: BTreeSet::new(),
             found: Found::default(),
+            callers: Callers::default(),
             routes: BTreeMap::new(),
             announcer: Announcer::default(),
             layer_announcer: Announcer::default(),
@@ -225,6 +231,19 @@ impl Registry {
         };
         let mut dirty = BTreeSet::new();
         for object in parsed {
+            if let Ok(ControlMessage::Call(call)) = &object.message {
+                let fault = self.check_call(now, scope, call, &object.pointer).err();
+                if let Some(fault) = &fault {
+                    outcome.refuse(object.topic, fault);
+                }
+                let Common { id, reply_to, .. } = &call.common;
+                let answers = |to| self.is_designated(scope, to, id.as_deref());
+                if reply_to.as_ref().is_some_and(answers) {
+                    let (call, pointer) = (call.clone(), object.pointer);
+                    outcome.calls.push(CallIn { scope, pointer, call, fault });
+                }
+                continue;
+            }
             let result = self.apply(now, scope, &object, &mut dirty, &mut outcome.touched);
             if let Err(error) = &result {
                 outcome.refuse(object.topic, error);
@@ -257,11 +276,6 @@ impl Registry {
     ) -> Result<u32, ControlError> {
         let message = object.message.as_ref().map_err(Clone::clone)?;
         let common = message.common();
-        if let ControlMessage::Call(_) = message {
-            let pointer = format!("{}/op", object.pointer);
-            let detail = "this flow is on no ROS 2 network: it cannot call services";
-            return Err(ControlError::new(ErrorCode::NoServer, pointer, detail));
-        }
         self.check_access(now, scope, message, &object.pointer)?;
         if scope == Scope::Layer
             && self.config.layer_answers_need_id
@@ -281,6 +295,23 @@ impl Registry {
         }
         touched.insert(common.topic.clone());
         Ok(applied.lease_s)
+    }
+
+    /// Whether a service may call another one: it advertises the requests.
+    fn check_call(
+        &mut self,
+        now: Instant,
+        scope: Scope,
+        call: &CallMessage,
+        pointer: &str,
+    ) -> Result<(), ControlError> {
+        let CalledTopics { request, .. } = CalledTopics::of(&call.common.topic, pointer)?;
+        let common = Common { topic: request, ..call.common.clone() };
+        let advertise = AdvertiseMessage {
+            common: common.clone(),
+            ..AdvertiseMessage::new(common.topic, common.service)
+        };
+        self.check_access(now, scope, &ControlMessage::Advertise(advertise), pointer)
     }
 
     /// Takes a topic's name on the layer broker, where the topic is to be on it.
@@ -332,17 +363,24 @@ impl Registry {
         if in_use && scope != Scope::Ros2 {
             self.leases.give_up(scope);
         }
-        let (node_scope, layer_scope) = (self.config.node_scope, self.config.layer_scope);
-        let (node_off, layer_off) =
-            (self.off.contains(&Scope::Node), self.off.contains(&Scope::Layer));
+        let layer_scope = self.config.layer_scope.filter(|_| !self.off.contains(&Scope::Layer));
         if let Some(own) = self.own_view() {
-            own.node_scope = node_scope && !node_off;
-            own.layer_scope = layer_scope.filter(|_| !layer_off);
+            own.layer_scope = layer_scope;
         }
+        self.show_node();
         self.show_ros2();
         let mut changed = self.all_topics();
         changed.extend(self.refresh(now, leased));
         changed
+    }
+
+    /// The own node scope in the world: calls come from it also where there is no broker.
+    fn show_node(&mut self) {
+        let has_broker = self.config.node_scope && !self.off.contains(&Scope::Node);
+        let calls = !self.callers.is_empty();
+        if let Some(own) = self.own_view() {
+            own.node_scope = has_broker || calls;
+        }
     }
 
     /// Whether the kept leases of a scope are still to be read.
@@ -392,6 +430,7 @@ impl Registry {
                     *entry = ScopeEntry::default();
                 }
             }
+            self.callers.add(&self.config.me, &topic, &mut merged.node);
             let Some(own) = self.world.flows.get_mut(&self.config.me) else {
                 continue;
             };

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-use blaze_domain::control::{ControlError, Event, EventKind};
-use blaze_domain::names::ChannelName;
+use blaze_domain::control::{CallMessage, ControlError, ErrorCode, Event, EventKind};
+use blaze_domain::names::{ChannelName, NameError};
 use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
 use serde_json::Value;
@@ -77,11 +77,51 @@ pub struct AnswerOut {
     pub designated: bool,
 }
 
+/// A call of a service that this flow is to answer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CallIn {
+    /// Where it was received.
+    pub scope: Scope,
+    /// Begins the pointers of its faults.
+    pub pointer: String,
+    /// The call.
+    pub call: CallMessage,
+    /// Why it is refused.
+    pub fault: Option<ControlError>,
+}
+
+/// The topics of a called service.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CalledTopics {
+    /// Its requests.
+    pub request: TopicName,
+    /// Its replies.
+    pub reply: TopicName,
+}
+
+impl CalledTopics {
+    /// Those of a service.
+    ///
+    /// # Errors
+    /// The name is too long for them.
+    pub fn of(service: &TopicName, pointer: &str) -> Result<Self, ControlError> {
+        let of = |last: &str| {
+            format!("{service}/{last}").parse().map_err(|error: NameError| {
+                let detail = format!("of its requests and replies: {error}");
+                ControlError::new(ErrorCode::InvalidTopic, format!("{pointer}/topic"), detail)
+            })
+        };
+        Ok(Self { request: of("_request")?, reply: of("_reply")? })
+    }
+}
+
 /// What a control payload did.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ControlOutcome {
     /// One for each object that wants one.
     pub answers: Vec<AnswerOut>,
+    /// Calls of services.
+    pub calls: Vec<CallIn>,
     /// Refusals.
     pub events: Vec<EventDraft>,
     /// Topics whose own entry in the world changed.

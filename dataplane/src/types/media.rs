@@ -44,13 +44,23 @@ pub fn cdr_of(type_name: &str) -> String {
 /// The media type of JSON.
 pub const JSON: &str = "application/json";
 
+/// The media type of requests of a client that wants its reply as JSON.
+pub const CALL: &str = "application/json; call=request";
+/// The media type of their replies.
+pub const CALL_REPLY: &str = "application/json; call=reply";
+/// The media type of what comes instead of a reply, where the request cannot be converted, or the
+/// reply: a `ControlError`.
+pub const CALL_FAULT: &str = "application/json; call=fault";
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn media_types_are_read_as_http_reads_them() {
-        for json in ["application/json", "Application/JSON; charset=utf-8", " application/json "] {
+        for json in
+            ["application/json", "Application/JSON; charset=utf-8", " application/json ", CALL]
+        {
             assert_eq!(Media::of(json), Media::Json, "{json}");
         }
         let typed = Media::Cdr { type_name: Some("a/msg/B") };

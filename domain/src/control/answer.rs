@@ -100,6 +100,9 @@ pub struct Answer {
     /// Seconds until the lease lapses; 0 = never, or withdrawn.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lease_s: Option<u32>,
+    /// What the called service replied.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reply: Option<Value>,
     /// Why it was refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<ControlError>,
@@ -109,13 +112,23 @@ impl Answer {
     /// The message was accepted by `flow` for `lease_s` seconds.
     #[must_use]
     pub fn granted(id: Option<String>, flow: &FlowId, lease_s: u32) -> Self {
-        Self { id, ok: true, flow: Some(flow.to_string()), lease_s: Some(lease_s), error: None }
+        Self { lease_s: Some(lease_s), ..Self::accepted(id, flow.to_string()) }
+    }
+
+    /// The service that a call was for has replied; `flow`: that of its server, `layer/node`.
+    #[must_use]
+    pub fn replied(id: Option<String>, flow: String, reply: Value) -> Self {
+        Self { reply: Some(reply), ..Self::accepted(id, flow) }
+    }
+
+    fn accepted(id: Option<String>, flow: String) -> Self {
+        Self { id, ok: true, flow: Some(flow), lease_s: None, reply: None, error: None }
     }
 
     /// The message was refused.
     #[must_use]
     pub fn refused(id: Option<String>, error: ControlError) -> Self {
-        Self { id, ok: false, flow: None, lease_s: None, error: Some(error) }
+        Self { id, ok: false, flow: None, lease_s: None, reply: None, error: Some(error) }
     }
 
     /// The answers of a payload: one object or an array. What is no answer is left out.

@@ -19,6 +19,9 @@ use super::{
 use crate::names::{ChannelName, InstanceName, NameError, TopicName};
 use crate::qos::{Durability, Reliability};
 
+/// Larger calls are not read, not even to answer them.
+const MAX_LARGE_CALL_BYTES: usize = 1024 * 1024;
+
 /// One object of a control payload.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParsedObject {
@@ -41,11 +44,12 @@ pub struct ParsedObject {
 /// single objects are in their [`ParsedObject`].
 pub fn parse_payload(payload: &[u8]) -> Result<Vec<ParsedObject>, ControlError> {
     if payload.len() > MAX_CONTROL_BYTES {
-        return Err(ControlError::new(
-            ErrorCode::InvalidValue,
-            "",
-            format!("has {} bytes, at most {MAX_CONTROL_BYTES} are allowed", payload.len()),
-        ));
+        let detail =
+            format!("has {} bytes, at most {MAX_CONTROL_BYTES} are allowed", payload.len());
+        return match large_call(payload, &detail) {
+            Some(call) => Ok(vec![call]),
+            None => Err(ControlError::new(ErrorCode::InvalidValue, "", detail)),
+        };
     }
     let not_json =
         |error: serde_json::Error| ControlError::new(ErrorCode::InvalidJson, "", error.to_string());
@@ -77,6 +81,17 @@ pub fn parse_payload(payload: &[u8]) -> Result<Vec<ParsedObject>, ControlError> 
         .enumerate()
         .map(|(index, text)| parse_element(text.get(), format!("/{index}")))
         .collect())
+}
+
+/// A call that is too large, so that its sender can be answered.
+fn large_call(payload: &[u8], detail: &str) -> Option<ParsedObject> {
+    if payload.len() > MAX_LARGE_CALL_BYTES {
+        return None;
+    }
+    let value: Value = serde_json::from_slice(payload).ok()?;
+    let object = value.as_object().filter(|object| object.get("op") == Some(&"call".into()))?;
+    let error = ControlError::new(ErrorCode::TooLarge, "/request", detail);
+    Some(ParsedObject { message: Err(error), ..parse_object(object, String::new()) })
 }
 
 fn parse_element(text: &str, pointer: String) -> ParsedObject {

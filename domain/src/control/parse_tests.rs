@@ -216,6 +216,25 @@ fn calls_need_somebody_who_gets_the_reply() {
 }
 
 #[test]
+fn a_call_that_is_too_large_can_be_answered() {
+    let call = |bytes: usize| {
+        let text = "x".repeat(bytes);
+        json!({"op": "call", "topic": "set_map", "service": "planner", "id": "7",
+            "reply_to": "blaze/reply/planner", "request": {"data": text}})
+        .to_string()
+    };
+    let [object] = &parse_payload(call(MAX_CONTROL_BYTES).as_bytes()).unwrap()[..] else {
+        panic!("one object")
+    };
+    let error = object.message.as_ref().unwrap_err();
+    assert_eq!((error.code, error.pointer.as_str()), (ErrorCode::TooLarge, "/request"));
+    assert_eq!(object.id.as_deref(), Some("7"));
+    assert_eq!(object.reply_to.as_ref().unwrap().as_str(), "blaze/reply/planner");
+    let absurd = parse_payload(call(2 * MAX_LARGE_CALL_BYTES).as_bytes());
+    assert_eq!(absurd.unwrap_err().code, ErrorCode::InvalidValue, "nobody reads that much");
+}
+
+#[test]
 fn faulty_objects_can_still_be_answered() {
     let object = one(&json!({"op": "fly", "topic": "a", "id": "7", "reply_to": "blaze/reply/x"}));
     assert_eq!(object.id.as_deref(), Some("7"));

@@ -56,7 +56,7 @@ fn network(shared: &Shared, ros2: &Ros2Scope, seen: &[Seen]) -> Value {
         "domain": ros2.domain, "interface": ros2.interface, "state": state, "detail": detail,
         "guid_prefix": network.own.map(|own| own.to_string()), "node": shared.me.ros2_node(),
         "participants": network.participants, "endpoints": endpoints,
-        "calls": {"pending": pending},
+        "calls": {"pending": pending + control.pending_calls()},
     })
 }
 

@@ -173,7 +173,10 @@ impl DataCore {
                 let here_us = message.here_us;
                 self.go_on(now, line, Converting { frame, ty: None, came: now, here_us, bridges });
             }
-            Err(failure) => self.cannot_convert(now, topic, &bridges, &failure),
+            Err(failure) => {
+                self.calls.note_failed(frame, &failure);
+                self.cannot_convert(now, topic, &bridges, &failure);
+            }
         }
     }
 
@@ -255,6 +258,7 @@ impl DataCore {
             }
             Err(failure) => {
                 if let Some(message) = self.compress.convert.give_up(place) {
+                    self.calls.note_failed(&message.frame, &failure);
                     self.leave_codec(topic, &message);
                     self.cannot_convert(now, topic, &message.bridges, &failure);
                 }

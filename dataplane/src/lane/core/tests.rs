@@ -1,6 +1,7 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
 mod allocation;
+mod calls;
 mod compress_stage;
 mod convert;
 mod load;

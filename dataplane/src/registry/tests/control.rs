@@ -531,14 +531,3 @@ fn a_request_says_in_which_forms_it_is_served() {
         assert_eq!((request.framed, request.bare, request.json), served, "{scope} {bare} {json}");
     }
 }
-
-#[test]
-fn a_call_is_answered_although_there_is_nobody_to_serve_it() {
-    let now = Instant::now();
-    let mut registry = Registry::new(config("edge/robot-1", 1, now));
-    let call = json!({"op": "call", "topic": "add_two_ints", "service": "planner", "id": "7",
-        "reply_to": "blaze/reply/planner", "request": {"a": 1}});
-    let outcome = say(&mut registry, now, Scope::Node, &call);
-    assert_eq!(outcome.answers[0].body["error"]["code"], "no_server");
-    assert_eq!((registry.lease_count(), outcome.changed.len()), (0, 0));
-}

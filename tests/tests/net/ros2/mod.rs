@@ -1,5 +1,6 @@
 //! ROS 2: rclpy and Cyclone DDS beside flows.
 
+mod call;
 mod churn;
 mod direct;
 mod graph;
