@@ -1,5 +1,5 @@
 //! Recorded camera pictures: `sensor_msgs/msg/CompressedImage` with JPEG becomes RGB, three bytes a
-//! pixel.
+//! pixel, or `sensor_msgs/msg/Image` with that.
 //!
 //! Pictures are decoded when a recording is loaded, by two threads. What would need more than
 //! [`MAX_DECODED_BYTES`] stays JPEG and is decoded just before it is due.
@@ -7,6 +7,7 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use blaze_domain::{MAX_PAYLOAD_BYTES, TopicName};
+use blaze_flow::types::media::cdr_of;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use zune_jpeg::JpegDecoder;
@@ -22,6 +23,9 @@ pub const MAX_DECODED_BYTES: usize = 512 * 1024 * 1024;
 const MAX_SIDE: usize = 16_384;
 const DECODER_THREADS: usize = 2;
 const COMPRESSED_IMAGE: &str = "sensor_msgs/msg/CompressedImage";
+const IMAGE: &str = "sensor_msgs/msg/Image";
+/// Bytes of an [`Pictures::Image`] before its pixels.
+const IMAGE_HEAD: usize = 52;
 const SUFFIX: &str = "/compressed";
 
 /// Why a message is no picture.
@@ -36,6 +40,41 @@ pub enum CameraError {
     /// Decoded it would be larger than a message may be.
     #[error("decoded it has {0} bytes, at most {MAX_PAYLOAD_BYTES} are allowed")]
     TooLarge(usize),
+}
+
+/// The form in which pictures are published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Pictures {
+    /// Pixels alone.
+    #[default]
+    Rgb,
+    /// CDR of `sensor_msgs/msg/Image`, for ROS 2 nodes.
+    Image,
+}
+
+impl Pictures {
+    fn head_bytes(self) -> usize {
+        match self {
+            Self::Rgb => 0,
+            Self::Image => IMAGE_HEAD,
+        }
+    }
+}
+
+/// An image without its pixels: no time stamp, frame `camera`, `rgb8`.
+fn image_head(width: u16, height: u16) -> Vec<u8> {
+    let (width, height) = (u32::from(width), u32::from(height));
+    let mut head = Vec::with_capacity(IMAGE_HEAD);
+    head.extend_from_slice(b"\0\x01\0\0");
+    head.extend_from_slice(&[0; 8]);
+    head.extend_from_slice(b"\x07\0\0\0camera\0\0");
+    head.extend_from_slice(&height.to_le_bytes());
+    head.extend_from_slice(&width.to_le_bytes());
+    // No big-endian pixels, and padding.
+    head.extend_from_slice(b"\x05\0\0\0rgb8\0\0\0\0");
+    head.extend_from_slice(&(3 * width).to_le_bytes());
+    head.extend_from_slice(&(3 * width * height).to_le_bytes());
+    head
 }
 
 /// What decoded pictures may still take.
@@ -117,57 +156,69 @@ fn decoder(jpeg: &[u8]) -> JpegDecoder<ZCursor<&[u8]>> {
     JpegDecoder::new_with_options(ZCursor::new(jpeg), options)
 }
 
-/// Bytes of a picture as RGB, from its header alone.
+/// Bytes of a picture that is decoded, from its header alone.
 ///
 /// # Errors
 /// [`CameraError::Jpeg`] or [`CameraError::TooLarge`].
-pub fn decoded_bytes(jpeg: &[u8]) -> Result<usize, CameraError> {
-    let mut decoder = decoder(jpeg);
-    decoder.decode_headers().map_err(|error| CameraError::Jpeg(error.to_string()))?;
-    let info = decoder.info().ok_or_else(|| CameraError::Jpeg("no size".to_owned()))?;
-    let bytes = usize::from(info.width) * usize::from(info.height) * 3;
+pub fn decoded_bytes(jpeg: &[u8], pictures: Pictures) -> Result<usize, CameraError> {
+    let (width, height) = size(&mut decoder(jpeg))?;
+    let bytes = pictures.head_bytes() + usize::from(width) * usize::from(height) * 3;
     if bytes > MAX_PAYLOAD_BYTES {
         return Err(CameraError::TooLarge(bytes));
     }
     Ok(bytes)
 }
 
-/// A picture as RGB: rows from the top, three bytes a pixel, nothing between rows.
+/// Width and height.
+fn size(decoder: &mut JpegDecoder<ZCursor<&[u8]>>) -> Result<(u16, u16), CameraError> {
+    decoder.decode_headers().map_err(|error| CameraError::Jpeg(error.to_string()))?;
+    let info = decoder.info().ok_or_else(|| CameraError::Jpeg("no size".to_owned()))?;
+    Ok((info.width, info.height))
+}
+
+/// A picture in RGB: rows from the top, three bytes a pixel, nothing between rows.
 ///
 /// # Errors
 /// [`CameraError::Jpeg`] or [`CameraError::TooLarge`].
-pub fn decode(jpeg: &[u8]) -> Result<Bytes, CameraError> {
-    let expected = decoded_bytes(jpeg)?;
-    let pixels = decoder(jpeg).decode().map_err(|error| CameraError::Jpeg(error.to_string()))?;
-    if pixels.len() != expected {
-        return Err(CameraError::Jpeg(format!("{} bytes instead of {expected}", pixels.len())));
+pub fn decode(jpeg: &[u8], pictures: Pictures) -> Result<Bytes, CameraError> {
+    let expected = decoded_bytes(jpeg, pictures)?;
+    let mut decoder = decoder(jpeg);
+    let (width, height) = size(&mut decoder)?;
+    let pixels = decoder.decode().map_err(|error| CameraError::Jpeg(error.to_string()))?;
+    let picture = match pictures {
+        Pictures::Rgb => pixels,
+        Pictures::Image => [image_head(width, height), pixels].concat(),
+    };
+    if picture.len() != expected {
+        return Err(CameraError::Jpeg(format!("{} bytes instead of {expected}", picture.len())));
     }
-    Ok(Bytes::from(pixels))
+    Ok(Bytes::from(picture))
 }
 
 /// Turns the topics that hold JPEG pictures into topics of RGB. Returns how many messages do not
 /// decode; they go.
 pub(super) fn decode_topics(
     raw: &mut RawRecording,
+    pictures: Pictures,
     taken: &[TopicName],
     budget: &mut Budget,
 ) -> u64 {
     let mut unusable = 0;
     for topic in 0..raw.topics.len() {
-        let Some((name, picture_bytes)) = decodable(raw, topic, taken) else {
+        let Some((name, picture_bytes)) = decodable(raw, topic, pictures, taken) else {
             continue;
         };
         let places: Vec<usize> =
             (0..raw.messages.len()).filter(|place| raw.messages[*place].0 == topic).collect();
-        let mut pictures: Vec<(usize, Result<Body, CameraError>)> =
+        let mut bodies: Vec<(usize, Result<Body, CameraError>)> =
             places.into_iter().map(|place| (place, jpeg_of(&raw.messages[place].2))).collect();
-        let needed = picture_bytes.saturating_mul(pictures.len());
+        let needed = picture_bytes.saturating_mul(bodies.len());
         if needed <= budget.0 {
             budget.0 -= needed;
-            decode_all(&mut pictures);
+            decode_all(&mut bodies, pictures);
         }
         let mut broken = Vec::new();
-        for (place, body) in pictures {
+        for (place, body) in bodies {
             match body {
                 Ok(body) => raw.messages[place].2 = body,
                 Err(_) => broken.push(place),
@@ -177,8 +228,10 @@ pub(super) fn decode_topics(
         remove_all(&mut raw.messages, &broken);
         let entry = &mut raw.topics[topic];
         entry.name = name;
-        entry.type_name = String::new();
-        entry.encoding = "application/octet-stream".to_owned();
+        (entry.type_name, entry.encoding) = match pictures {
+            Pictures::Rgb => (String::new(), "application/octet-stream".to_owned()),
+            Pictures::Image => (IMAGE.to_owned(), cdr_of(IMAGE)),
+        };
         entry.decoded_bytes = Some(picture_bytes);
     }
     unusable
@@ -196,7 +249,12 @@ fn remove_all<T>(elements: &mut Vec<T>, places: &[usize]) {
 }
 
 /// The name and the size of the pictures of a topic, if it holds JPEG and the name is free.
-fn decodable(raw: &RawRecording, topic: usize, taken: &[TopicName]) -> Option<(TopicName, usize)> {
+fn decodable(
+    raw: &RawRecording,
+    topic: usize,
+    pictures: Pictures,
+    taken: &[TopicName],
+) -> Option<(TopicName, usize)> {
     let entry = &raw.topics[topic];
     if entry.type_name != COMPRESSED_IMAGE {
         return None;
@@ -207,7 +265,7 @@ fn decodable(raw: &RawRecording, topic: usize, taken: &[TopicName]) -> Option<(T
     }
     let (_, _, body) = raw.messages.iter().find(|(of, _, _)| *of == topic)?;
     match jpeg_of(body).ok()? {
-        Body::Jpeg(jpeg) => Some((name, decoded_bytes(&jpeg).ok()?)),
+        Body::Jpeg(jpeg) => Some((name, decoded_bytes(&jpeg, pictures).ok()?)),
         Body::Ready(_) => None,
     }
 }
@@ -222,17 +280,17 @@ fn jpeg_of(body: &Body) -> Result<Body, CameraError> {
     }
 }
 
-fn decode_all(pictures: &mut [(usize, Result<Body, CameraError>)]) {
+fn decode_all(bodies: &mut [(usize, Result<Body, CameraError>)], pictures: Pictures) {
     let next = AtomicUsize::new(0);
     let slots: Vec<Mutex<&mut Result<Body, CameraError>>> =
-        pictures.iter_mut().map(|(_, body)| Mutex::new(body)).collect();
+        bodies.iter_mut().map(|(_, body)| Mutex::new(body)).collect();
     std::thread::scope(|scope| {
         for _ in 0..DECODER_THREADS.min(slots.len()) {
             scope.spawn(|| {
                 while let Some(slot) = slots.get(next.fetch_add(1, Ordering::Relaxed)) {
                     let mut slot = slot.lock();
                     if let Ok(Body::Jpeg(jpeg)) = &**slot {
-                        **slot = decode(jpeg).map(Body::Ready);
+                        **slot = decode(jpeg, pictures).map(Body::Ready);
                     }
                 }
             });

@@ -73,9 +73,10 @@ async fn prepare(
     start: Instant,
 ) -> Result<(System, Script), CliError> {
     let files = options.record.clone();
+    let pictures = options.pictures();
     let reading = tokio::task::spawn_blocking(move || match files.as_slice() {
-        [] => recording::load_built_in(),
-        files => recording::load_all(files),
+        [] => recording::load_built_in(pictures),
+        files => recording::load_all(files, pictures),
     });
     let nodes = start_nodes(options, &supervisor).await?;
     let recordings = reading
@@ -88,7 +89,7 @@ async fn prepare(
     let names = options.nodes();
     let board = Arc::new(Board::new(topics.clone(), &names, start));
     let changes = plan(options, &nodes, &topics);
-    let (ready, configuration) = tokio::join!(wait_ready(&nodes), async {
+    let (ready, configuration) = tokio::join!(wait_ready(&nodes, options.ros2), async {
         match &changes {
             Ok(_) => start_configuration(&nodes, &supervisor).await.map(Some),
             Err(_) => Ok(None),

@@ -27,11 +27,11 @@ fn claim_port(domain: u16) -> u16 {
     base_port(domain) + 249
 }
 
-/// Finds a domain that nobody on this host uses at `address`, beginning with [`DEFAULT_DOMAIN`].
-/// `None`: all are taken.
+/// Finds a domain that nobody on this host uses at `address`, beginning with [`DEFAULT_DOMAIN`],
+/// but for one that has another use. `None`: all are taken.
 #[must_use]
-pub fn reserve(address: Ipv4Addr) -> Option<ReservedDomain> {
-    (DEFAULT_DOMAIN..=MAX_DDS_DOMAIN).find_map(|domain| {
+pub fn reserve(address: Ipv4Addr, but: Option<u16>) -> Option<ReservedDomain> {
+    (DEFAULT_DOMAIN..=MAX_DDS_DOMAIN).filter(|domain| Some(*domain) != but).find_map(|domain| {
         let claim = bind(Ipv4Addr::LOCALHOST, claim_port(domain))?;
         // SPDP and user traffic of the first participant, whoever started it.
         let free =
@@ -56,19 +56,22 @@ mod tests {
 
     #[test]
     fn two_demos_have_two_domains() {
-        let first = reserve(Ipv4Addr::LOCALHOST).unwrap();
-        let second = reserve(Ipv4Addr::LOCALHOST).unwrap();
+        let first = reserve(Ipv4Addr::LOCALHOST, None).unwrap();
+        let second = reserve(Ipv4Addr::LOCALHOST, None).unwrap();
         assert_ne!(first.domain, second.domain);
         assert!((DEFAULT_DOMAIN..=MAX_DDS_DOMAIN).contains(&second.domain));
+        let free = second.domain;
+        drop(second);
+        assert_ne!(reserve(Ipv4Addr::LOCALHOST, Some(free)).unwrap().domain, free);
     }
 
     #[test]
     fn a_domain_with_a_participant_is_left_alone() {
-        let probe = reserve(Ipv4Addr::LOCALHOST).unwrap();
+        let probe = reserve(Ipv4Addr::LOCALHOST, None).unwrap();
         let domain = probe.domain;
         let _participant = bind(Ipv4Addr::LOCALHOST, base_port(domain) + 10).unwrap();
         drop(probe);
-        assert!(reserve(Ipv4Addr::LOCALHOST).unwrap().domain > domain);
+        assert!(reserve(Ipv4Addr::LOCALHOST, None).unwrap().domain > domain);
     }
 
     #[test]

@@ -14,7 +14,7 @@ use serde_json::Value;
 use super::brokers::{BrokerSource, NodeBrokers};
 use super::domain_id::{self, DEFAULT_DOMAIN, ReservedDomain};
 use super::options::{DemoNode, DemoOptions};
-use super::roles::PUBLISHING_NODE;
+use super::roles::{PUBLISHING_NODE, ROS2_NODE};
 use crate::exit::CliError;
 use crate::node_file;
 
@@ -58,7 +58,8 @@ pub(super) async fn start_nodes(
             "--listen {listen}: no interface of this host has this address."
         )));
     }
-    let reserved = if options.is_complete() { domain_id::reserve(listen) } else { None };
+    let reserved =
+        if options.is_complete() { domain_id::reserve(listen, options.ros2) } else { None };
     let domain = match &reserved {
         Some(reserved) => reserved.domain,
         None if options.is_complete() => {
@@ -124,9 +125,13 @@ fn settings_of(
         ),
         ("admin.flow", "\"127.0.0.1:0\"".to_owned()),
     ];
+    let ros2 = options.ros2.filter(|_| node == ROS2_NODE);
+    let ros2 =
+        ros2.map(|domain| ("brokers.plugins", format!("[{{ ros2: {{ domain: {domain} }} }}]")));
     let sources = Sources {
         overrides: own
             .into_iter()
+            .chain(ros2)
             .map(|(key, value)| (key.to_owned(), value))
             .chain(options.set.iter().map(|setting| (setting.key.clone(), setting.value.clone())))
             .collect(),
@@ -144,7 +149,7 @@ fn settings_of(
 ///
 /// # Errors
 /// [`CliError::Failed`] for one that is not in time.
-pub(super) async fn wait_ready(nodes: &Nodes) -> Result<(), CliError> {
+pub(super) async fn wait_ready(nodes: &Nodes, ros2: Option<u16>) -> Result<(), CliError> {
     for running in &nodes.running {
         let name = running.node.name();
         tokio::time::timeout(READY_TIMEOUT, running.flow.ready()).await.map_err(|_| {
@@ -154,7 +159,9 @@ pub(super) async fn wait_ready(nodes: &Nodes) -> Result<(), CliError> {
                 running.flow.admin()
             ))
         })?;
-        eprintln!("ready node={name} admin={}", running.flow.admin());
+        let ros2 = ros2.filter(|_| running.node == ROS2_NODE);
+        let ros2 = ros2.map(|domain| format!(" ros2={domain}")).unwrap_or_default();
+        eprintln!("ready node={name} admin={}{ros2}", running.flow.admin());
     }
     Ok(())
 }

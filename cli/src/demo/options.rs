@@ -5,8 +5,10 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
+use blaze_domain::node_file::MAX_DDS_DOMAIN;
 use clap::{Args, ValueEnum};
 
+use super::camera::Pictures;
 use crate::exit::CliError;
 
 /// Shortest and longest run.
@@ -29,6 +31,11 @@ pub struct DemoOptions {
     /// Run these nodes only; they find the others over DDS
     #[arg(long, value_enum, value_name = "NODE", value_delimiter = ',', num_args = 1)]
     pub only: Vec<DemoNode>,
+    /// Show the topics on a ROS 2 network of this host, in cloud-1: ROS_DOMAIN_ID, 0 to 100.
+    /// With --only, give it to the processes of robot-1 and cloud-1
+    #[arg(long, value_name = "DOMAIN")]
+    #[arg(value_parser = clap::value_parser!(u16).range(..=i64::from(MAX_DDS_DOMAIN)))]
+    pub ros2: Option<u16>,
     /// Address that the nodes of this process listen on
     #[arg(long, value_name = "IP")]
     pub listen: Option<IpAddr>,
@@ -148,6 +155,12 @@ impl DemoOptions {
         self.nodes().len() == DemoNode::ALL.len()
     }
 
+    /// The form of pictures: ROS 2 nodes read messages alone.
+    #[must_use]
+    pub fn pictures(&self) -> Pictures {
+        if self.ros2.is_some() { Pictures::Image } else { Pictures::Rgb }
+    }
+
     /// Checks what the options mean together.
     ///
     /// # Errors
@@ -161,6 +174,13 @@ impl DemoOptions {
         }
         if self.listen.is_some_and(|address| address.is_unspecified()) {
             return usage("--listen: name the address of one interface, for example 10.0.1.1.");
+        }
+        let has_ros2 = |node: &DemoNode| matches!(node, DemoNode::Robot1 | DemoNode::Cloud1);
+        if self.ros2.is_some() && !self.nodes().iter().any(has_ros2) {
+            return usage(
+                "--ros2: cloud-1 is on the ROS 2 network, and robot-1 plays for it; neither runs \
+                 in this process.",
+            );
         }
         Ok(())
     }
@@ -201,13 +221,14 @@ mod tests {
         let options = parse(
             "--duration 1.5m --only robot-1,edge-2 --listen 10.0.1.1 --peer 10.0.3.1 --peer \
              10.0.4.1 \
-             --set flow.bandwidth.limit_mbps=40 --record a.mcap b.mcap",
+             --set flow.bandwidth.limit_mbps=40 --ros2 7 --record a.mcap b.mcap",
         )
         .unwrap();
         assert_eq!(options.duration, Duration::from_secs(90));
         assert_eq!(options.nodes(), [DemoNode::Robot1, DemoNode::Edge2]);
         assert_eq!(options.peer.len(), 2);
         assert_eq!(options.record.len(), 2);
+        assert_eq!((options.ros2, options.pictures()), (Some(7), Pictures::Image));
         assert_eq!(options.set[0].key, "flow.bandwidth.limit_mbps");
         options.check().unwrap();
     }
@@ -224,6 +245,7 @@ mod tests {
             ("--set flow..x=1", "is no key"),
             ("--set a.b=[1", "no YAML"),
             ("--listen here", "invalid IP"),
+            ("--ros2 101", "0..=100"),
         ] {
             let error = parse(line).unwrap_err();
             assert!(error.to_string().contains(why), "{line:?}: {error}");
@@ -233,7 +255,11 @@ mod tests {
 
     #[test]
     fn bad_combinations_are_refused_with_a_reason() {
-        for (line, why) in [("--listen 0.0.0.0", "one interface"), ("--peer ::1", "IPv4 only")] {
+        for (line, why) in [
+            ("--listen 0.0.0.0", "one interface"),
+            ("--peer ::1", "IPv4 only"),
+            ("--only fog-1 --ros2 3", "cloud-1"),
+        ] {
             let error = parse(line).unwrap().check().unwrap_err();
             assert!(error.to_string().contains(why), "{line:?}: {error}");
             assert_eq!(error.exit() as u8, 2);

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use parking_lot::{Condvar, Mutex};
 
-use super::camera::{self, CameraError};
+use super::camera::{self, CameraError, Pictures};
 use super::recording::{Body, Recording};
 use super::schedule::{Due, Schedule};
 
@@ -180,19 +180,25 @@ fn start_decoder(
     }
     let (sender, receiver) = sync_channel(PICTURES_AHEAD);
     let schedule = Schedule::new(recordings);
+    let pictures: Vec<_> = recordings.iter().map(|recording| recording.pictures).collect();
     std::thread::Builder::new()
         .name("picture-decoder".to_owned())
-        .spawn(move || decode_ahead(schedule, &sender))?;
+        .spawn(move || decode_ahead(schedule, &pictures, &sender))?;
     Ok(Some(receiver))
 }
 
-fn decode_ahead(schedule: Schedule, sender: &SyncSender<Result<Bytes, CameraError>>) {
+fn decode_ahead(
+    schedule: Schedule,
+    pictures: &[Pictures],
+    sender: &SyncSender<Result<Bytes, CameraError>>,
+) {
     let lookup = schedule.clone();
     for due in schedule {
         let due: Due = due;
         let Some(message) = lookup.message(&due) else { return };
+        let form = pictures.get(due.recording).copied().unwrap_or_default();
         if let Body::Jpeg(jpeg) = &message.body
-            && sender.send(camera::decode(jpeg)).is_err()
+            && sender.send(camera::decode(jpeg, form)).is_err()
         {
             return;
         }

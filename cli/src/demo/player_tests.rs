@@ -19,6 +19,7 @@ fn recording(offsets_ms: &[u64], period_ms: u64) -> Arc<Recording> {
         unusable_messages: 0,
         cut: None,
         shortened: (0, Duration::ZERO),
+        pictures: Pictures::Rgb,
     })
 }
 

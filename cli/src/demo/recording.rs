@@ -17,7 +17,7 @@ use mcap::McapError;
 use mcap::io::MessageReader;
 use mcap::sans_io::LinearReaderOptions;
 
-use super::camera;
+use super::camera::{self, Pictures};
 
 /// Largest file, and most bytes of messages, that are kept in memory (2 GiB).
 pub const MAX_RECORDING_BYTES: u64 = 2 * 1024 * 1024 * 1024;
@@ -192,6 +192,8 @@ pub struct Recording {
     pub cut: Option<String>,
     /// Times without a message that were shortened, and the longest.
     pub shortened: (u64, Duration),
+    /// The form of its pictures.
+    pub pictures: Pictures,
 }
 
 /// The recordings that the program carries with it.
@@ -205,14 +207,14 @@ const BUILT_IN: [(&str, &[u8]); 2] = [
 ///
 /// # Errors
 /// None as long as they are whole; they are part of the program.
-pub fn load_built_in() -> Result<Vec<Recording>, RecordingError> {
-    let mut pictures = camera::Budget::default();
+pub fn load_built_in(pictures: Pictures) -> Result<Vec<Recording>, RecordingError> {
+    let mut budget = camera::Budget::default();
     BUILT_IN
         .into_iter()
         .map(|(name, bytes)| {
             let path = Path::new(name);
             let raw = read_records(path, bytes, &[])?;
-            raw.prepare(path, &[], &mut pictures)
+            raw.prepare(path, pictures, &[], &mut budget)
         })
         .collect()
 }
@@ -221,12 +223,13 @@ pub fn load_built_in() -> Result<Vec<Recording>, RecordingError> {
 ///
 /// # Errors
 /// [`RecordingError`] for the first file that cannot be played.
-pub fn load_all(paths: &[PathBuf]) -> Result<Vec<Recording>, RecordingError> {
+pub fn load_all(paths: &[PathBuf], pictures: Pictures) -> Result<Vec<Recording>, RecordingError> {
     let mut taken = Vec::new();
-    let mut pictures = camera::Budget::default();
+    let mut budget = camera::Budget::default();
     let mut recordings = Vec::with_capacity(paths.len());
     for path in paths {
-        let recording = read_file(path, &taken)?.prepare(path, &taken, &mut pictures)?;
+        let raw = read_file(path, &taken)?;
+        let recording = raw.prepare(path, pictures, &taken, &mut budget)?;
         taken.extend(recording.topics.iter().map(|topic| topic.name.clone()));
         recordings.push(recording);
     }
@@ -410,18 +413,19 @@ impl RawRecording {
     fn prepare(
         mut self,
         path: &Path,
+        pictures: Pictures,
         taken: &[TopicName],
-        pictures: &mut camera::Budget,
+        budget: &mut camera::Budget,
     ) -> Result<Recording, RecordingError> {
-        self.unusable += camera::decode_topics(&mut self, taken, pictures);
+        self.unusable += camera::decode_topics(&mut self, pictures, taken, budget);
         if self.messages.is_empty() {
             return Err(RecordingError::Empty { path: path.to_owned(), skipped: self.skipped });
         }
-        Ok(self.finish(path))
+        Ok(self.finish(path, pictures))
     }
 
     /// Orders the messages and works out the pace.
-    fn finish(mut self, path: &Path) -> Recording {
+    fn finish(mut self, path: &Path, pictures: Pictures) -> Recording {
         self.messages.sort_by_key(|(_, time, _)| *time);
         let first = self.messages.first().map_or(0, |(_, time, _)| *time);
         let mut paces: BTreeMap<usize, Pace> = BTreeMap::new();
@@ -475,6 +479,7 @@ impl RawRecording {
             unusable_messages: self.unusable,
             cut: self.cut,
             shortened,
+            pictures,
         }
     }
 }

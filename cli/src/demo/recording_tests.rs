@@ -2,6 +2,7 @@ use std::collections::BTreeMap;
 use std::io::BufWriter;
 use std::time::Instant;
 
+use blaze_flow::types::{Encoding, MessageType, Types};
 use mcap::WriteOptions;
 use mcap::records::MessageHeader;
 
@@ -50,7 +51,7 @@ fn recorded(
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("a.mcap");
     write(&path, compression, &[channel], messages);
-    load_all(&[path]).unwrap().remove(0)
+    load_all(&[path], Pictures::Rgb).unwrap().remove(0)
 }
 
 fn payload(message: &RecordedMessage) -> &Bytes {
@@ -68,7 +69,7 @@ fn second(count: u64) -> u64 {
 
 #[test]
 fn the_jackal_recording_is_read() {
-    let recording = &load_all(&[data("jackal.mcap")]).unwrap()[0];
+    let recording = &load_all(&[data("jackal.mcap")], Pictures::Rgb).unwrap()[0];
     assert_eq!(recording.messages.len(), 6_121);
     let mut names: Vec<&str> = recording.topics.iter().map(|topic| topic.name.as_str()).collect();
     names.sort_unstable();
@@ -86,7 +87,7 @@ fn the_jackal_recording_is_read() {
 
 #[test]
 fn the_program_carries_its_recordings() {
-    let recordings = load_built_in().unwrap();
+    let recordings = load_built_in(Pictures::Rgb).unwrap();
     let names: Vec<&str> = recordings
         .iter()
         .flat_map(|recording| &recording.topics)
@@ -98,7 +99,7 @@ fn the_program_carries_its_recordings() {
 #[test]
 fn camera_pictures_are_rgb() {
     let start = Instant::now();
-    let recording = &load_all(&[data("camera.mcap")]).unwrap()[0];
+    let recording = &load_all(&[data("camera.mcap")], Pictures::Rgb).unwrap()[0];
     eprintln!("camera.mcap read and decoded in {:?}", start.elapsed());
     assert_eq!(recording.topics.len(), 1);
     let topic = &recording.topics[0];
@@ -117,19 +118,40 @@ fn camera_pictures_are_rgb() {
 }
 
 #[test]
+fn camera_pictures_are_images_for_ros_2() {
+    let recording = &load_all(&[data("camera.mcap")], Pictures::Image).unwrap()[0];
+    let topic = &recording.topics[0];
+    assert_eq!(topic.encoding, "application/cdr; type=sensor_msgs/msg/Image");
+    let types = Types::default();
+    let image = types.get(Instant::now(), MessageType { name: &topic.type_name, hash: "" });
+    let picture = payload(&recording.messages[0]);
+    let json = image.unwrap().convert(Encoding::Json, picture).unwrap().payload;
+    let mut image: serde_json::Value = serde_json::from_slice(&json).unwrap();
+    assert_eq!((topic.max_bytes, picture.len()), (52 + 921_600, 52 + 921_600));
+    let pixels = image["data"].take();
+    assert_eq!(pixels.as_str().unwrap().len(), 921_600 / 3 * 4);
+    let stamp = serde_json::json!({"sec": 0, "nanosec": 0});
+    let expected = serde_json::json!({
+        "header": {"stamp": stamp, "frame_id": "camera"}, "height": 480, "width": 640,
+        "encoding": "rgb8", "is_bigendian": 0, "step": 1920, "data": null,
+    });
+    assert_eq!(image, expected);
+}
+
+#[test]
 fn pictures_beyond_the_budget_stay_jpeg() {
     let path = data("camera.mcap");
     let mut raw = read_file(&path, &[]).unwrap();
     let mut budget = camera::Budget::of(921_600 * 90 - 1);
-    assert_eq!(camera::decode_topics(&mut raw, &[], &mut budget), 0);
-    let recording = raw.finish(&path);
+    assert_eq!(camera::decode_topics(&mut raw, Pictures::Rgb, &[], &mut budget), 0);
+    let recording = raw.finish(&path, Pictures::Rgb);
     assert_eq!(recording.topics[0].name.as_str(), "camera/image_raw");
     assert_eq!(recording.topics[0].max_bytes, 921_600);
     for message in &recording.messages[..3] {
         let Body::Jpeg(jpeg) = &message.body else {
             panic!("decoded in spite of the budget");
         };
-        assert_eq!(camera::decode(jpeg).unwrap().len(), 921_600);
+        assert_eq!(camera::decode(jpeg, Pictures::Rgb).unwrap().len(), 921_600);
     }
 }
 
@@ -173,7 +195,7 @@ fn what_cannot_be_played_is_named() {
     ];
     let messages: Vec<_> = (0..5).map(|channel| (channel, second(1), vec![0])).collect();
     write(&path, None, &channels, &messages);
-    let recording = &load_all(std::slice::from_ref(&path)).unwrap()[0];
+    let recording = &load_all(std::slice::from_ref(&path), Pictures::Rgb).unwrap()[0];
     assert_eq!(recording.topics.len(), 1);
     let reasons: Vec<(&str, &SkipReason)> =
         recording.skipped.iter().map(|skipped| (skipped.topic.as_str(), &skipped.reason)).collect();
@@ -185,7 +207,7 @@ fn what_cannot_be_played_is_named() {
     ));
     assert_eq!(reasons[3], ("/blaze/x", &SkipReason::Name(NameError::Reserved)));
 
-    let error = load_all(&[path.clone(), path]).unwrap_err();
+    let error = load_all(&[path.clone(), path], Pictures::Rgb).unwrap_err();
     assert!(error.to_string().contains("/imu/data: imu/data is played already"), "{error}");
 }
 
@@ -200,13 +222,13 @@ fn files_that_are_no_recording_are_refused() {
         (b"SQLite format 3\0xxxxxxx", "ros2 bag convert"),
     ] {
         std::fs::write(&path, content).unwrap();
-        let error = load_all(std::slice::from_ref(&path)).unwrap_err().to_string();
+        let error = load_all(std::slice::from_ref(&path), Pictures::Rgb).unwrap_err().to_string();
         assert!(error.contains(why) && error.contains("x.mcap"), "{error}");
     }
-    let missing = load_all(&[directory.path().join("none.mcap")]).unwrap_err();
+    let missing = load_all(&[directory.path().join("none.mcap")], Pictures::Rgb).unwrap_err();
     assert!(matches!(missing, RecordingError::Open { .. }));
     write(&path, None, &[], &[]);
-    let error = load_all(std::slice::from_ref(&path)).unwrap_err().to_string();
+    let error = load_all(std::slice::from_ref(&path), Pictures::Rgb).unwrap_err().to_string();
     assert!(error.contains("holds no messages"), "{error}");
 }
 
@@ -216,12 +238,12 @@ fn a_damaged_file_says_where() {
     let path = directory.path().join("cut.mcap");
     let whole = std::fs::read(data("jackal.mcap")).unwrap();
     std::fs::write(&path, &whole[..whole.len() / 2]).unwrap();
-    let recording = load_all(std::slice::from_ref(&path)).unwrap().remove(0);
+    let recording = load_all(std::slice::from_ref(&path), Pictures::Rgb).unwrap().remove(0);
     let cut = recording.cut.unwrap();
     assert!(cut.starts_with(&format!("after byte {} and ", whole.len() / 2)), "{cut}");
     assert!(recording.messages.len() > 1_000, "{cut}");
     std::fs::write(&path, &whole[..100]).unwrap();
-    let error = load_all(std::slice::from_ref(&path)).unwrap_err();
+    let error = load_all(std::slice::from_ref(&path), Pictures::Rgb).unwrap_err();
     assert!(matches!(error, RecordingError::Broken { .. }), "{error}");
     assert!(error.to_string().contains("after byte 100 and 0 messages"), "{error}");
 }
@@ -258,7 +280,7 @@ fn a_publisher_that_kept_messages_is_known() {
         let header = MessageHeader { channel_id, sequence: 0, log_time: 7, publish_time: 7 };
         writer.write_to_known_channel(&header, &[1]).unwrap();
         writer.finish().unwrap();
-        let recording = load_all(std::slice::from_ref(&path)).unwrap().remove(0);
+        let recording = load_all(std::slice::from_ref(&path), Pictures::Rgb).unwrap().remove(0);
         assert_eq!(recording.topics[0].durability, durability, "{profiles}");
     }
 }
@@ -276,7 +298,7 @@ fn any_damage_is_an_error_and_no_panic() {
         std::fs::write(&path, damaged).unwrap();
         // Damage in an index or a checksum of the summary may stay unseen; what is read is bounded
         // all the same.
-        if let Ok(recordings) = load_all(std::slice::from_ref(&path)) {
+        if let Ok(recordings) = load_all(std::slice::from_ref(&path), Pictures::Rgb) {
             assert!(recordings[0].messages.len() <= messages.len());
         }
     }

@@ -27,6 +27,8 @@ pub const MOVES_FROM: DemoNode = DemoNode::Fog1;
 pub const MOVES_TO: DemoNode = DemoNode::Cloud1;
 /// Who plays.
 pub const PUBLISHING_NODE: DemoNode = DemoNode::Robot1;
+/// The node with the ROS 2 network.
+pub const ROS2_NODE: DemoNode = DemoNode::Cloud1;
 
 /// A topic that is played, and how it is advertised.
 #[derive(Debug, Clone)]

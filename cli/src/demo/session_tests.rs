@@ -5,6 +5,7 @@ use blaze_sdk::SubscriptionStats;
 use parking_lot::Mutex;
 
 use super::*;
+use crate::demo::camera::Pictures;
 use crate::demo::changes::{ChangePlan, Taken, Wanted};
 use crate::demo::options::DemoNode;
 use crate::demo::recording::{Recording, load_built_in};
@@ -114,7 +115,7 @@ async fn run_with(
     changes: Result<ChangePlan, String>,
 ) -> (Summary, String, Vec<Wanted>) {
     let recordings: Vec<Arc<Recording>> =
-        load_built_in().unwrap().into_iter().map(Arc::new).collect();
+        load_built_in(Pictures::Rgb).unwrap().into_iter().map(Arc::new).collect();
     let topics = played_topics(recordings.iter().map(Arc::as_ref));
     let board = Arc::new(Board::new(topics.clone(), &DemoNode::ALL, Instant::now()));
     let wire = Wire {

@@ -56,7 +56,7 @@ struct Figures {
 /// # Errors
 /// [`CliError`]: no broker, no flow, refused, the output was closed.
 pub async fn run(options: HzOptions, format: Format) -> Result<Exit, CliError> {
-    let service = LocalService::start(&options.target, "hz").await?;
+    let service = LocalService::start(&options.target.node_file()?, "hz").await?;
     let outcome = measure(&service, &options, format).await;
     service.end().await;
     outcome.map(|()| Exit::Done)

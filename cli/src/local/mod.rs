@@ -10,6 +10,7 @@ mod call;
 mod echo;
 mod hz;
 mod publish;
+mod types;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -58,6 +59,14 @@ pub struct LocalTopic {
     pub config: Option<PathBuf>,
 }
 
+impl LocalTopic {
+    /// The node file.
+    fn node_file(&self) -> Result<NodeFile, CliError> {
+        let sources = Sources::of_process(self.config.clone(), Vec::new());
+        node_file::read(&sources).map_err(CliError::Invalid)
+    }
+}
+
 /// The command line as a service, and the broker that it uses.
 struct LocalService {
     manager: ServiceManager,
@@ -66,13 +75,11 @@ struct LocalService {
 
 impl LocalService {
     /// Connects, and starts a service `blaze-<command>` whose instance is the process.
-    async fn start(target: &LocalTopic, command: &str) -> Result<Self, CliError> {
-        let sources = Sources::of_process(target.config.clone(), Vec::new());
-        let file = node_file::read(&sources).map_err(CliError::Invalid)?;
+    async fn start(file: &NodeFile, command: &str) -> Result<Self, CliError> {
         let id = file
             .flow_id()
             .ok_or_else(|| CliError::Invalid("the node file names no layer and node".to_owned()))?;
-        let (broker, scope) = open(&file)?;
+        let (broker, scope) = open(file)?;
         wait_until_up(&broker).await?;
         let fault = |what: &str, error: &dyn std::fmt::Display| {
             CliError::Failed(format!("{what}: {error}"))

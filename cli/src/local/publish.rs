@@ -1,8 +1,11 @@
 //! `blaze pub`.
 
 use std::io::{BufRead, Read as _};
+use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_domain::WhyCode;
+use blaze_flow::types::{CompiledType, Encoding};
 use blaze_sdk::{Advertise, FlowEventKind, FlowEvents, PublishOutcome, Publisher};
 use bytes::Bytes;
 use clap::Args;
@@ -10,6 +13,7 @@ use serde_json::json;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout_at};
 
+use super::types::KnownTypes;
 use super::{LocalService, LocalTopic, lease_error, reliability};
 use crate::ends::interrupted;
 use crate::exit::{CliError, Exit};
@@ -37,6 +41,10 @@ pub struct PublishOptions {
     /// Media type of the payload
     #[arg(long, value_name = "TYPE", default_value = "application/json")]
     pub encoding: String,
+    /// ROS 2 type of the payload, which is JSON: ROS 2 nodes get it as a message of this type
+    #[arg(long = "type", value_name = "PKG/msg/NAME", value_parser = parse_type)]
+    #[arg(conflicts_with = "encoding")]
+    pub type_name: Option<String>,
     /// Ask that lost messages are sent again
     #[arg(long)]
     pub reliable: bool,
@@ -53,13 +61,36 @@ fn parse_rate(text: &str) -> Result<f64, String> {
     }
 }
 
+fn parse_type(text: &str) -> Result<String, String> {
+    let is_name = |part: &&str| {
+        part.starts_with(|first: char| first.is_ascii_alphabetic())
+            && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+    };
+    let parts: Vec<&str> = text.split('/').collect();
+    match parts[..] {
+        _ if !parts.iter().all(is_name) => {}
+        [_, "msg" | "srv" | "action", _] => return Ok(text.to_owned()),
+        [package, name] => return Err(format!("did you mean {package}/msg/{name}?")),
+        _ => {}
+    }
+    Err("it is PKG/msg/NAME, for example geometry_msgs/msg/Twist".to_owned())
+}
+
 /// Publishes.
 ///
 /// # Errors
 /// [`CliError`]: no broker, no flow, refused.
 pub async fn run(options: PublishOptions, format: Format) -> Result<Exit, CliError> {
-    let service = LocalService::start(&options.target, "pub").await?;
-    let outcome = publish(&service, &options).await;
+    let file = options.target.node_file()?;
+    let check = match &options.type_name {
+        Some(name) => Check::of(KnownTypes::of(&file), name).await?,
+        None => Check(None),
+    };
+    if options.payload != "-" {
+        check.payload(options.payload.as_bytes())?;
+    }
+    let service = LocalService::start(&file, "pub").await?;
+    let outcome = publish(&service, &options, &check).await;
     service.end().await;
     let sent = outcome?;
     let text = match format {
@@ -75,12 +106,39 @@ pub async fn run(options: PublishOptions, format: Format) -> Result<Exit, CliErr
     Ok(if sent.dropped == 0 { Exit::Done } else { Exit::Failed })
 }
 
+/// Finds faults of JSON before it is published.
+struct Check(Option<Arc<CompiledType>>);
+
+impl Check {
+    /// Payloads of a type. One without a definition here is not checked, and that is printed.
+    async fn of(mut types: KnownTypes, name: &str) -> Result<Self, CliError> {
+        match types.get(std::time::Instant::now(), name).await {
+            Ok(found) => Ok(Self(Some(found))),
+            Err(failure) if failure.code == WhyCode::TypeUnknown => {
+                eprintln!("blaze: the payload is not checked: {}", failure.detail);
+                Ok(Self(None))
+            }
+            Err(failure) => Err(CliError::Invalid(failure.detail)),
+        }
+    }
+
+    fn payload(&self, json: &[u8]) -> Result<(), CliError> {
+        let Some(found) = &self.0 else { return Ok(()) };
+        let refused = |detail| CliError::Invalid(format!("no {}: {detail}", found.name));
+        found.convert(Encoding::Cdr, json).map(drop).map_err(|failure| refused(failure.detail))
+    }
+}
+
 struct Sent {
     published: u64,
     dropped: u64,
 }
 
-async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sent, CliError> {
+async fn publish(
+    service: &LocalService,
+    options: &PublishOptions,
+    check: &Check,
+) -> Result<Sent, CliError> {
     let topic = &options.target.topic;
     let kind = service.broker.kind();
     let reliability = reliability(options.reliable);
@@ -88,6 +146,7 @@ async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sen
     let advertise = Advertise {
         rate_hz: options.rate,
         encoding: options.encoding.clone(),
+        type_name: options.type_name.clone().unwrap_or_default(),
         reliability,
         ..Advertise::new(topic.clone())
     };
@@ -111,7 +170,7 @@ async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sen
         .map_err(|error| CliError::Failed(format!("publish {topic}: {error}")))?;
     route_up(&mut events, options).await;
     let mut sent = tokio::select! {
-        sent = feed(options, &publisher) => sent?,
+        sent = feed(options, check, &publisher) => sent?,
         stopped = interrupted() =>
             { stopped?; Sent { published: publisher.sequence(), dropped: 0 } }
     };
@@ -139,7 +198,11 @@ async fn route_up(events: &mut FlowEvents, options: &PublishOptions) {
     }
 }
 
-async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, CliError> {
+async fn feed(
+    options: &PublishOptions,
+    check: &Check,
+    publisher: &Publisher,
+) -> Result<Sent, CliError> {
     let mut pace = options.rate.map(|rate| {
         let mut ticks = interval(Duration::from_secs_f64(1.0 / rate));
         // What is late is made up for, so that the rate holds.
@@ -155,7 +218,11 @@ async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, C
         let payload = match &mut lines {
             None => fixed.clone(),
             Some(lines) => match lines.recv().await {
-                Some(line) => line?,
+                Some(line) => {
+                    let line = line?;
+                    check.payload(&line)?;
+                    line
+                }
                 None => break,
             },
         };
@@ -217,6 +284,34 @@ fn next_line(input: &mut impl BufRead) -> Result<Option<Bytes>, CliError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn types_have_three_parts() {
+        for good in ["geometry_msgs/msg/Twist", "std_srvs/srv/SetBool_Request"] {
+            assert_eq!(parse_type(good).as_deref(), Ok(good));
+        }
+        let meant = parse_type("std_msgs/String").unwrap_err();
+        assert_eq!(meant, "did you mean std_msgs/msg/String?");
+        for bad in ["", "Twist", "a/b/C", "/msg/C", "a/msg/", "a/msg/B C", "a/msg/B/C", "a/msg/1"] {
+            assert!(parse_type(bad).unwrap_err().contains("PKG/msg/NAME"), "{bad}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_fault_of_the_json_is_found_before_it_is_published() {
+        let tree = json!({"admin": {"flow": "127.0.0.1:0"}});
+        let file = blaze_domain::node_file::NodeFile::read(&tree).unwrap().0;
+        let check = Check::of(KnownTypes::of(&file), "geometry_msgs/msg/Twist").await.unwrap();
+        check.payload(br#"{"linear":{"x":0.5}}"#).unwrap();
+        let error = check.payload(br#"{"linear":{"x":"fast"}}"#).unwrap_err();
+        assert_eq!(error.exit(), Exit::Invalid);
+        assert_eq!(
+            error.to_string(),
+            "no geometry_msgs/msg/Twist: /linear/x: expected a number, found text"
+        );
+        let unknown = Check::of(KnownTypes::of(&file), "a/msg/B").await.unwrap();
+        unknown.payload(b"anything").unwrap();
+    }
 
     #[test]
     fn lines_come_without_their_ends_and_not_too_long() {

@@ -6,6 +6,7 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use blaze_cli::demo::camera::Pictures;
 use blaze_cli::demo::recording::{Body, load_built_in};
 use blaze_domain::LayerName;
 use blaze_flow::limit::allocate::{Sharing, Terms};
@@ -77,7 +78,7 @@ fn pictures() -> anyhow::Result<&'static str> {
 fn write_pictures() -> anyhow::Result<tempfile::NamedTempFile> {
     let mut file = tempfile::NamedTempFile::new()?;
     let mut written = 0;
-    for recording in load_built_in()? {
+    for recording in load_built_in(Pictures::Rgb)? {
         let camera = recording.topics.iter().position(|topic| topic.name.as_str() == CAMERA);
         let pictures = recording.messages.iter().filter(|message| Some(message.topic) == camera);
         for picture in pictures.take(PICTURES - written) {

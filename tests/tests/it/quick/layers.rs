@@ -30,6 +30,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     (
         "blaze",
         &[
+            "blaze-convert",
             "blaze-domain",
             "blaze-proto",
             "blaze-runtime",
