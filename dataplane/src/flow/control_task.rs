@@ -22,6 +22,8 @@ use tokio_util::sync::CancellationToken;
 use super::Shared;
 use super::plane::{News, wall_ms};
 use crate::control::{Duty, Output};
+use crate::lane::path::TopicInfo;
+use crate::plan::TopicPlan;
 use crate::registry::peers_channel;
 use crate::world::FlowState;
 
@@ -221,6 +223,7 @@ impl ControlTask {
             Output::Link { to, body } => {
                 plane.link(|engine| engine.send_control(&to, *body));
             }
+            Output::Types { from, body } => self.shared.definitions.take(from, *body),
             Output::Announce { version, digest } => {
                 plane.link(|engine| engine.set_registry(version, digest));
             }
@@ -233,6 +236,7 @@ impl ControlTask {
                 }
             }
             Output::Plan { topic, plan, info, duty } => {
+                self.prepare_types(now, &plan, &info);
                 let places = self.shared.routes.apply(&topic, &plan, *info, &duty);
                 if duty == Duty::GivesUp {
                     self.shared.control.lock().given_up(now, wall_ms(), &topic, places);
@@ -295,6 +299,14 @@ impl ControlTask {
                     side.release(&channel);
                 }
             }
+        }
+    }
+
+    /// A type that is to be converted is sought before its first message comes.
+    fn prepare_types(&self, now: Instant, plan: &TopicPlan, info: &TopicInfo) {
+        let to_json = plan.bridges.iter().any(|bridge| bridge.to.is_json());
+        if let Some(published) = info.types.published.as_ref().filter(|_| to_json) {
+            self.shared.types.prepare(now, published.borrowed());
         }
     }
 

@@ -1,6 +1,7 @@
 //! ROS 2: rclpy and Cyclone DDS beside flows.
 
 mod churn;
+mod definitions;
 mod direct;
 mod graph;
 mod long;
