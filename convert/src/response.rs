@@ -1,12 +1,16 @@
-//! Type descriptions that come as messages: the response of a node's `get_type_description`.
+//! Type descriptions that come as messages: request and response of a node's
+//! `get_type_description`.
 
 use serde::Deserialize;
+use serde_json::json;
 
 use crate::built_in::{Distro, built_in};
-use crate::description::{DescriptionError, TypeDescription};
+use crate::description::{DescriptionError, TypeDescription, at_most};
+use crate::limits::MAX_DEFINITION_BYTES;
 use crate::program::Program;
 
 const DESCRIPTION: &str = "type_description_interfaces/msg/TypeDescription";
+const REQUEST: &str = "type_description_interfaces/srv/GetTypeDescription_Request";
 const RESPONSE: &str = "type_description_interfaces/srv/GetTypeDescription_Response";
 
 /// The members that are needed.
@@ -18,6 +22,20 @@ struct Response {
 }
 
 impl TypeDescription {
+    /// CDR of `type_description_interfaces/srv/GetTypeDescription_Request`, which asks for a type
+    /// without the text of its files.
+    ///
+    /// # Errors
+    /// For texts that CDR cannot have, such as one with NUL.
+    pub fn request(type_name: &str, hash: &str) -> Result<Vec<u8>, DescriptionError> {
+        let request =
+            json!({"type_name": type_name, "type_hash": hash, "include_type_sources": false});
+        let mut cdr = Vec::new();
+        let written = program(REQUEST)?.to_cdr(request.to_string().as_bytes(), &mut cdr);
+        written.map_err(|error| DescriptionError::Syntax(error.to_string()))?;
+        Ok(cdr)
+    }
+
     /// Reads CDR of `type_description_interfaces/msg/TypeDescription`.
     ///
     /// # Errors
@@ -41,13 +59,18 @@ impl TypeDescription {
 }
 
 /// The definition of the message is our own, whatever release the node is of: all are the same.
-fn json(type_name: &str, cdr: &[u8]) -> Result<Vec<u8>, DescriptionError> {
+fn program(type_name: &str) -> Result<Program, DescriptionError> {
     let fault = |text: String| DescriptionError::Syntax(text);
     let description = built_in(Distro::Jazzy).describe(type_name);
     let description = description.map_err(|error| fault(error.to_string()))?;
-    let program = Program::compile(&description).map_err(|error| fault(error.to_string()))?;
+    Program::compile(&description).map_err(|error| fault(error.to_string()))
+}
+
+fn json(type_name: &str, cdr: &[u8]) -> Result<Vec<u8>, DescriptionError> {
+    at_most("bytes", cdr.len(), MAX_DEFINITION_BYTES)?;
     let mut json = Vec::new();
-    program.to_json(cdr, &mut json).map_err(|error| fault(error.to_string()))?;
+    let read = program(type_name)?.to_json(cdr, &mut json);
+    read.map_err(|error| DescriptionError::Syntax(error.to_string()))?;
     Ok(json)
 }
 
@@ -73,6 +96,18 @@ mod tests {
     }
 
     #[test]
+    fn a_request_names_the_type_and_its_hash() {
+        let request = TypeDescription::request("a/msg/B", "RIHS01_00").expect("a request");
+        let mut json = Vec::new();
+        program(REQUEST).expect("built in").to_json(&request, &mut json).expect("it is one");
+        assert_eq!(
+            String::from_utf8_lossy(&json),
+            r#"{"type_name":"a/msg/B","type_hash":"RIHS01_00","include_type_sources":false}"#
+        );
+        assert!(TypeDescription::request("a\0b", "").is_err());
+    }
+
+    #[test]
     fn a_node_may_have_no_description() {
         let response = cdr(RESPONSE, r#"{"failure_reason":"no such type"}"#);
         let error = TypeDescription::from_response(&response).expect_err("none");
@@ -83,5 +118,7 @@ mod tests {
             Err(DescriptionError::TypeName(String::new()))
         );
         assert!(TypeDescription::from_response(&[0, 1, 0, 0, 1]).is_err());
+        let error = TypeDescription::from_response(&vec![0; MAX_DEFINITION_BYTES + 1]);
+        assert!(error.expect_err("too large").to_string().contains("1048577 bytes"));
     }
 }

@@ -9,6 +9,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD as BASE64;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -330,6 +332,14 @@ impl End<'_> {
         let mut command = json!(stream);
         command["op"] = json!("publish");
         self.ask(command).map(drop)
+    }
+
+    /// Publishes one message: CDR with its encapsulation.
+    ///
+    /// # Errors
+    /// As [`Peer::ask`].
+    pub fn send(&self, cdr: &[u8]) -> anyhow::Result<()> {
+        self.ask(json!({ "op": "publish", "data": BASE64.encode(cdr) })).map(drop)
     }
 
     /// Publishes messages and waits until all are; gives those.

@@ -11,7 +11,7 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use super::endpoint::{RosEndpoint, Vendor};
-use super::names::RosName;
+use super::names::{Carries, RosName};
 use super::services;
 use crate::dds::adapter::{Admission, LONGEST_DOUBT};
 use crate::dds::{EndpointId, Endpoints, FoundEndpoint, GuidPrefix, participant_of};
@@ -167,9 +167,14 @@ impl Knowledge {
         let state = self.state.lock();
         let is_own = state.own == Some(participant_of(writer));
         let is_other = |it: &Entry| it.endpoint.dds_type != dds_type || !it.endpoint.is_readable();
-        let is_other = state.endpoints.get(writer).is_some_and(is_other);
+        let known = state.endpoints.get(writer);
+        // Replies are for whom the request was of, and told apart by that.
+        let replies = known.is_some_and(|it| it.endpoint.name.carries == Carries::Replies);
         match state.owned.get(writer) {
-            _ if is_own || is_other || state.marked.contains(writer) => Admission::No,
+            _ if is_own || known.is_some_and(is_other) || state.marked.contains(writer) => {
+                Admission::No
+            }
+            _ if replies => Admission::Yes,
             Some(true) => Admission::Yes,
             Some(false) => Admission::No,
             None => Admission::Later,
@@ -416,6 +421,17 @@ mod tests {
             Admission::Later,
             "it is not known any more"
         );
+    }
+
+    #[test]
+    fn replies_are_taken_whoever_owns_their_server() {
+        let knowledge = Knowledge::new();
+        let server = found(1, "rr/addReply", TYPE);
+        assert_eq!(knowledge.admission(&server.id, TYPE), Admission::Later, "not found yet");
+        knowledge.note_endpoints(Instant::now(), &writers(vec![server.clone()]));
+        assert_eq!(knowledge.admission(&server.id, TYPE), Admission::Yes);
+        knowledge.set_owned([(server.id, false)].into());
+        assert_eq!(knowledge.admission(&server.id, TYPE), Admission::Yes);
     }
 
     #[test]

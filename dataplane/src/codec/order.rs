@@ -350,11 +350,22 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
         group.held.add(bytes);
         let line = group.lines.entry(writer).or_insert_with(Line::new);
         line.places.insert(number, place);
-        let Some(urgency) = urgency else { return };
+        if let Some(urgency) = urgency {
+            self.enlist((name, writer), number, urgency);
+        }
+    }
+
+    /// A place waits from now on until somebody begins with it.
+    fn enlist(&mut self, (name, writer): (G, L), number: u64, urgency: Urgency) {
         let at = urgency as usize;
-        self.waits[at].add(bytes);
-        group.waits.add(bytes);
-        line.waits[at].push_back(number);
+        let Some(group) = self.groups.get_mut(&name) else { return };
+        let Some(line) = group.lines.get_mut(&writer) else { return };
+        let Some(place) = line.places.get_mut(&number) else { return };
+        place.stage = Stage::Waits;
+        self.waits[at].add(place.bytes);
+        group.waits.add(place.bytes);
+        let older = line.waits[at].partition_point(|other| *other < number);
+        line.waits[at].insert(older, number);
         if !std::mem::replace(&mut line.in_rounds[at], true) {
             group.rounds[at].push_back(writer);
         }
@@ -394,6 +405,16 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
         let line = group.lines.get_mut(&ticket.key.1)?;
         let place = line.places.get_mut(&ticket.number)?;
         (place.stage == Stage::Begun).then_some(&mut place.item)
+    }
+
+    /// A place that is begun waits again, with its turn among those of its line. `false`: it was not
+    /// begun.
+    pub fn wait_again(&mut self, ticket: &Ticket<G, L>, urgency: Urgency) -> bool {
+        let is_begun = self.begun(ticket).is_some();
+        if is_begun {
+            self.enlist(ticket.key, ticket.number, urgency);
+        }
+        is_begun
     }
 
     /// What was to be done is done. `bytes`: what the item holds from now on; this is taken

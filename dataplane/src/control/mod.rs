@@ -28,6 +28,7 @@ use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, Scope, TopicName};
+use blaze_proto::link::link_control::Body;
 use bytes::Bytes;
 
 use crate::link::LinkEvent;
@@ -57,6 +58,8 @@ pub const QUIET: Duration = Duration::from_millis(50);
 pub const LATEST: Duration = Duration::from_millis(250);
 /// A flow listens for peers this long before it is ready.
 pub const LISTEN: Duration = Duration::from_millis(1500);
+/// A message about a definition is of no use later: it is asked for again.
+const TYPES_WITHIN: Duration = Duration::from_secs(2);
 /// All topics are planned anew that often, changed or not.
 pub const RECONCILE: Duration = Duration::from_secs(5);
 
@@ -248,7 +251,10 @@ impl ControlCore {
                 }
                 self.registry.on_hello(now, &from, &hello)
             }
-            LinkEvent::Control { from, body } => self.registry.on_control(now, &from, body),
+            LinkEvent::Control { from, body } => match self.of_types(&from, body) {
+                Some(body) => self.registry.on_control(now, &from, body),
+                None => BTreeSet::new(),
+            },
             LinkEvent::PeerUp(Endpoint { flow, .. }) | LinkEvent::PeerRecovered { flow } => {
                 self.registry.set_reach(now, &flow, Reach::Up)
             }
@@ -264,6 +270,25 @@ impl ControlCore {
         };
         self.touch(now, changed);
         self.hurry(now);
+    }
+
+    /// Takes out what is about definitions of types.
+    fn of_types(&mut self, from: &FlowId, body: Body) -> Option<Body> {
+        if matches!(body, Body::TypeRequest(_) | Body::TypeDefinition(_)) {
+            self.outputs.push_back(Output::Types { from: from.clone(), body: Box::new(body) });
+            return None;
+        }
+        Some(body)
+    }
+
+    /// Sends a TypeRequest or TypeDefinition to another flow: over the link, or where that does not
+    /// reach it over the layer broker.
+    pub fn send_types(&mut self, now: Instant, to: &FlowId, body: Body) {
+        if self.registry.is_on_layer_alone(to) {
+            self.say(Some(to), body, Some(now + TYPES_WITHIN));
+        } else {
+            self.outputs.push_back(Output::Link { to: to.clone(), body: Box::new(body) });
+        }
     }
 
     /// A message could not be converted.

@@ -31,7 +31,14 @@ pub enum Output {
         /// The JSON.
         body: Bytes,
     },
-    /// Send a registry message to a flow.
+    /// Another flow sent a TypeRequest or a TypeDefinition.
+    Types {
+        /// The flow.
+        from: FlowId,
+        /// The message.
+        body: Box<Body>,
+    },
+    /// Send a registry message, or one about a definition, to a flow.
     Link {
         /// The flow.
         to: FlowId,

@@ -119,7 +119,10 @@ impl ControlCore {
             Body::Hello(hello) => {
                 self.registry.on_layer_hello(now, &from, &hello, channel.began, appended_ms)
             }
-            body => self.registry.on_layer_control(now, &from, channel.epoch, body),
+            body => match self.of_types(&from, body) {
+                Some(body) => self.registry.on_layer_control(now, &from, channel.epoch, body),
+                None => return true,
+            },
         };
         let any = !changed.is_empty();
         self.touch(now, changed);
@@ -254,7 +257,7 @@ impl ControlCore {
         }
     }
 
-    fn say(&mut self, to: Option<&FlowId>, body: Body, deadline: Option<Instant>) {
+    pub(super) fn say(&mut self, to: Option<&FlowId>, body: Body, deadline: Option<Instant>) {
         let message = LinkControl {
             body: Some(body),
             channel: Some(Channel {

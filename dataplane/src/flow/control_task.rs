@@ -23,6 +23,8 @@ use super::Shared;
 use super::plane::{News, wall_ms, wall_ns};
 use super::routes::SourceState;
 use crate::control::{Duty, Output};
+use crate::lane::path::TopicInfo;
+use crate::plan::TopicPlan;
 use crate::registry::peers_channel;
 use crate::world::FlowState;
 
@@ -255,6 +257,7 @@ impl ControlTask {
             Output::Link { to, body } => {
                 plane.link(|engine| engine.send_control(&to, *body));
             }
+            Output::Types { from, body } => self.shared.definitions.take(from, *body),
             Output::Announce { version, digest } => {
                 plane.link(|engine| engine.set_registry(version, digest));
             }
@@ -270,6 +273,7 @@ impl ControlTask {
                 plane.with(|state| state.send_call(now, wall_ns(), request));
             }
             Output::Plan { topic, plan, info, duty } => {
+                self.prepare_types(now, &plan, &info);
                 let places = self.shared.routes.apply(&topic, &plan, *info, &duty);
                 if duty == Duty::GivesUp {
                     self.shared.control.lock().given_up(now, wall_ms(), &topic, places);
@@ -332,6 +336,14 @@ impl ControlTask {
                     side.release(&channel);
                 }
             }
+        }
+    }
+
+    /// A type that is to be converted is sought before its first message comes.
+    fn prepare_types(&self, now: Instant, plan: &TopicPlan, info: &TopicInfo) {
+        let to_json = plan.bridges.iter().any(|bridge| bridge.to.is_json());
+        if let Some(published) = info.types.published.as_ref().filter(|_| to_json) {
+            self.shared.types.prepare(now, published.borrowed());
         }
     }
 

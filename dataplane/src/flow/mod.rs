@@ -7,6 +7,7 @@
 //! | scope task | health of a local broker, the leases that it keeps → control core | per local scope |
 //! | network task | endpoints of a ROS 2 network → control core | 1 where there is one |
 //! | calls task | replies of servers on a ROS 2 network → JSON for calls → message path | 1 where there is one |
+//! | types tasks | definitions of ROS 2 types from nodes and other flows, and for those | 8 |
 //! | peers task | who else uses the layer broker, and what they say | 1 where there is one |
 //! | source task | one topic of one local scope → message path | per topic and scope that is read |
 //! | inter thread | joins and leaves the inter scope, as the control core wants | 1 where there is one |
@@ -21,6 +22,7 @@ mod admin;
 mod allocation;
 mod calls;
 mod control_task;
+mod definitions;
 mod epochs;
 mod health;
 mod inter;
@@ -62,6 +64,7 @@ use crate::registry::{LayerNames, peers_channel};
 use crate::types::{Types, built_in_for};
 use crate::world::LayerScopeId;
 use control_task::Leave;
+use definitions::Definitions;
 pub use epochs::Epochs;
 use health::{readiness, watch_health};
 use inter::InterScope;
@@ -112,6 +115,8 @@ pub(crate) struct Shared {
     pub(crate) limiter: Mutex<Limiter>,
     /// ROS 2 types, for conversions.
     pub(crate) types: Arc<Types>,
+    /// Definitions that other flows are asked for, and ask for.
+    pub(crate) definitions: Definitions,
     pub(crate) live: Mutex<LiveSettings>,
     pub(crate) readiness: Readiness,
     /// Whether the control channels of node and layer are read.
@@ -209,7 +214,8 @@ pub async fn start_with(
     let said_layer_scope = said_layer_scope(layer.as_ref());
     let layer_kind = layer.as_ref().map(|layer| layer.broker.kind());
 
-    let types = Arc::new(types_of(settings.ros2.as_ref()));
+    let (definitions, wishes) = Definitions::new();
+    let types = Arc::new(types_of(settings.ros2.as_ref()).asking(definitions.wishes()));
     let mut core = DataCore::new(DataConfig {
         me: settings.me.clone(),
         epoch,
@@ -287,6 +293,7 @@ pub async fn start_with(
         egress,
         limiter: Mutex::new(Limiter::new(settings.live.bandwidth.clone())),
         types,
+        definitions,
         live: Mutex::new(settings.live),
         readiness: readiness.clone(),
         hears: Default::default(),
@@ -320,6 +327,7 @@ pub async fn start_with(
     };
     let control = supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
     watch_brokers(&shared, &supervisor, epoch);
+    definitions::start(&shared, wishes, &supervisor);
     if shared.ros2.is_some() {
         let follow = ros2::follow_network(Arc::clone(&shared), supervisor.shutdown_token());
         supervisor.spawn("network", TaskPolicy::Essential, follow);

@@ -165,6 +165,7 @@ impl PlaneState {
         {
             engine.handle_timeout(now);
         }
+        self.core.look_for_types(now);
         let drained = self.core.drain(now, &mut self.engine);
         let timeout = self.engine.as_ref().and_then(Engine::next_timeout);
         drained.into_iter().chain(timeout).min()

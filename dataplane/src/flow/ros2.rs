@@ -35,7 +35,7 @@ pub(crate) struct Ros2Scope {
     pub(crate) broker: Arc<Ros2Broker>,
     pub(crate) domain: u16,
     pub(crate) interface: Ipv4Addr,
-    namespace: String,
+    pub(super) namespace: String,
     /// Where the flow is.
     network: Ros2Network,
     rules: watch::Sender<Ros2Live>,

@@ -20,6 +20,7 @@ mod inward;
 mod level;
 mod outward;
 
+use std::collections::BTreeMap;
 use std::ops::AddAssign;
 use std::time::Instant;
 
@@ -35,7 +36,7 @@ use crate::codec::effort::shares;
 use crate::codec::order::{Bounds, InOrder, Ticket, Waiting};
 use crate::codec::pool::{Urgency, threads_for_long};
 use crate::codec::{Done, Work};
-use crate::types::Encoding;
+use crate::types::{Encoding, MessageType};
 use convert::Converting;
 pub(super) use convert::ToBrokers;
 pub use convert::{ConvertStats, Unconverted};
@@ -108,6 +109,8 @@ pub struct CodecJob {
     pub work: Work,
 }
 
+type ConvertTicket = Ticket<TopicId, (WriterId, Encoding)>;
+
 /// Which message that is.
 #[derive(Debug, Clone, Copy)]
 pub struct CodecTicket {
@@ -118,7 +121,7 @@ pub struct CodecTicket {
 enum Place {
     Out(Ticket<TopicId, WriterId>),
     Into(Ticket<TopicId, WriterId>),
-    Convert(Ticket<TopicId, (WriterId, Encoding)>),
+    Convert(ConvertTicket),
 }
 
 /// Ways through the stage; jobs of one urgency take turns among them, so that none starves another.
@@ -150,6 +153,8 @@ pub(super) struct CompressStage {
     out: InOrder<TopicId, WriterId, Outward>,
     into: InOrder<TopicId, WriterId, Box<Admitted>>,
     convert: InOrder<TopicId, (WriterId, Encoding), Converting>,
+    /// Messages whose types are sought with others, as if somebody worked on them.
+    unknown: BTreeMap<MessageType, Vec<ConvertTicket>>,
     /// Jobs that were requested and have not begun, by urgency.
     requested: [usize; Urgency::ALL.len()],
     /// The way of the last job, by urgency.
@@ -169,6 +174,7 @@ impl Default for CompressStage {
             // already paced them and decompression is fast.
             into: InOrder::new(Bounds { waiting_of_one: bounds.bytes_of_one, ..bounds }),
             convert: InOrder::new(bounds),
+            unknown: BTreeMap::new(),
             requested: [0; Urgency::ALL.len()],
             last: [Way::Convert; Urgency::ALL.len()],
             refused: 0,
@@ -267,6 +273,7 @@ impl DataCore {
     pub fn stop_compression(&mut self, now: Instant, link: &mut dyn LaneLink) {
         self.compress.enabled = false;
         self.compress.requested = Default::default();
+        self.give_up_unknown(now);
         for urgency in Urgency::ALL {
             while let Some(place) = self.compress.out.begin(urgency).map(|(place, _)| place) {
                 if let Some(out) = self.compress.out.give_up(&place) {

@@ -88,7 +88,7 @@ pub enum LinkEvent {
         /// When it was handed out.
         at: Instant,
     },
-    /// A Delta, SnapshotRequest or Snapshot for the registry.
+    /// A Delta, SnapshotRequest or Snapshot for the registry, a TypeRequest or TypeDefinition.
     Control {
         /// The flow that sent it.
         from: FlowId,

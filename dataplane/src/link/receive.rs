@@ -206,13 +206,16 @@ impl Engine {
                 self.goodbye_received(now, at);
             }
             Body::Goodbye(_) => self.counters.stale += 1,
-            Body::Delta(_) | Body::SnapshotRequest(_) | Body::Snapshot(_) => {
+            Body::Delta(_)
+            | Body::SnapshotRequest(_)
+            | Body::Snapshot(_)
+            | Body::TypeRequest(_)
+            | Body::TypeDefinition(_) => {
                 if peer.is_connected() {
                     self.ledger.events.push_back(LinkEvent::Control { from, body });
                 }
             }
-            // Nobody here asks for definitions yet.
-            Body::Hello(_) | Body::TypeRequest(_) | Body::TypeDefinition(_) => {}
+            Body::Hello(_) => {}
         }
     }
 

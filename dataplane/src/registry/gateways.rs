@@ -166,6 +166,12 @@ impl Registry {
         self.remotes.get(flow).is_some_and(|remote| remote.ways.layer.is_some())
     }
 
+    /// Whether a flow is reached over the layer broker, and not over the inter scope.
+    pub(crate) fn is_on_layer_alone(&self, flow: &FlowId) -> bool {
+        let ways = self.remotes.get(flow).map(|remote| remote.ways);
+        ways.is_some_and(|ways| ways.over_layer() && !ways.over_link())
+    }
+
     /// Whether a flow that was heard there is not any more, and says on the inter scope that it has
     /// another layer broker, or none.
     pub(super) fn has_left_layer(

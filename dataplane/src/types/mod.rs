@@ -3,15 +3,21 @@
 //! ```text
 //! message ─► known? ─► compiled ─► converted at once
 //!              └ no ─► pool: get ─► built in, folders, added ─► compiled, or unknown for 5 s
+//!                                                    ▲                     └ wish
+//!                            flow/definitions.rs: add └── nodes, flows ◄────────┘
 //! ```
 //!
-//! Two locks, never held together: that of the definitions is held while a search begins, not while
-//! it reads files; that of the compiled types for one look-up.
+//! Three locks, never held together: that of the definitions is held while a search begins, not
+//! while it reads files; that of the compiled types, and that of those sought with others, for one
+//! look-up.
 
 mod cache;
 mod convert;
 pub mod media;
+mod parts;
+mod seek;
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -23,9 +29,13 @@ use blaze_convert::{
 use blaze_domain::WhyCode;
 use blaze_domain::node_file::Ros2Distro;
 use parking_lot::Mutex;
+use tokio::sync::{mpsc, watch};
 
 use cache::Cache;
 pub use convert::{CompiledType, Conversion, ConvertFailure, Converted, Encoding};
+pub(crate) use parts::{Parts, parts_of};
+pub use seek::Wish;
+pub(crate) use seek::{Others, seek};
 
 /// How long an unknown type is not sought again: a file may have come, or a node have answered.
 const RETRY: Duration = Duration::from_secs(5);
@@ -84,6 +94,17 @@ type Found = Result<Arc<CompiledType>, ConvertFailure>;
 pub struct Types {
     sources: Mutex<Sources>,
     compiled: Mutex<Cache>,
+    sought: Sought,
+}
+
+/// Types that are sought with others.
+#[derive(Debug, Default)]
+struct Sought {
+    pending: Mutex<BTreeSet<MessageType>>,
+    /// To those who seek them; `None`: nobody does.
+    wishes: Option<mpsc::Sender<Wish>>,
+    /// Changes whenever a search has ended.
+    ended: watch::Sender<()>,
 }
 
 /// Where definitions come from. They are read at the first search: a flow that converts nothing
@@ -109,7 +130,14 @@ impl Types {
     pub fn new(distro: Distro, folders: Vec<PathBuf>) -> Self {
         warn_of_missing(&folders);
         let sources = Sources { distro, folders, definitions: None };
-        Self { sources: Mutex::new(sources), compiled: Mutex::default() }
+        Self { sources: Mutex::new(sources), compiled: Mutex::default(), sought: Sought::default() }
+    }
+
+    /// The same, which lets others seek what it does not find itself.
+    #[must_use]
+    pub fn asking(mut self, wishes: mpsc::Sender<Wish>) -> Self {
+        self.sought.wishes = Some(wishes);
+        self
     }
 
     /// Other folders. All types are sought anew.
@@ -168,19 +196,56 @@ impl Types {
         found
     }
 
-    /// Seeks a definition in all sources, and compiles it.
+    /// Seeks a definition in what this flow has, and compiles it. Another one is wished for: it
+    /// comes by [`add`](Self::add), for the messages after it.
     fn seek(&self, ty: MessageType<&str>) -> Found {
         match self.find(ty) {
             Some(found) => compile(ty.name, &found),
-            // Sources that have to be asked first (the endpoint's node, the publisher's flow) are
-            // to be asked here. Their answer comes by `add`, for the messages after it.
             None => {
+                self.wish(ty);
                 let name = ty.name;
                 let with = if ty.hash.is_empty() { "" } else { " with the hash " };
                 let detail = format!("no definition of {name}{with}{}", ty.hash);
                 Err(ConvertFailure::new(WhyCode::TypeUnknown, detail))
             }
         }
+    }
+
+    /// Lets a type be found before the first message that needs it. One that was sought a moment
+    /// ago is not sought again.
+    pub fn prepare(&self, now: Instant, ty: MessageType<&str>) {
+        if self.known(now, ty).is_none() {
+            self.wish(ty);
+        }
+    }
+
+    /// Lets others seek a definition. Where too many are sought it is dropped: the next message
+    /// wishes for it again.
+    fn wish(&self, ty: MessageType<&str>) {
+        let Some(wishes) = &self.sought.wishes else { return };
+        let ty = ty.owned();
+        if self.sought.pending.lock().insert(ty.clone())
+            && wishes.try_send(Wish { ty: ty.clone(), asker: None }).is_err()
+        {
+            self.sought.pending.lock().remove(&ty);
+        }
+    }
+
+    /// Whether others are asked for the definition of a type.
+    #[must_use]
+    pub fn is_sought(&self, ty: &MessageType) -> bool {
+        self.sought.pending.lock().contains(ty)
+    }
+
+    /// Others have been asked for a definition, whatever came of it.
+    pub(crate) fn sought(&self, ty: &MessageType) {
+        self.sought.pending.lock().remove(ty);
+        self.sought.ended.send_replace(());
+    }
+
+    /// Changes whenever a search with others has ended.
+    pub(crate) fn searches(&self) -> watch::Receiver<()> {
+        self.sought.ended.subscribe()
     }
 
     /// The definition of a type, from what this flow has.

@@ -199,6 +199,7 @@ enum Act {
     Ready(Key, usize),
     Wait(Key, Urgency, usize, usize),
     Begin(Urgency),
+    Again(usize, Urgency),
     Finish(usize, usize),
     GiveUp(usize),
     Pop(Key),
@@ -212,6 +213,7 @@ fn act() -> impl Strategy<Value = Act> {
         7 => (key(), urgency(), 0usize..40, 0usize..4)
             .prop_map(|(key, urgency, bytes, keep)| Act::Wait(key, urgency, bytes, keep)),
         4 => urgency().prop_map(Act::Begin),
+        2 => (0usize..100, urgency()).prop_map(|(at, urgency)| Act::Again(at, urgency)),
         5 => (0usize..100, 0usize..40).prop_map(|(at, bytes)| Act::Finish(at, bytes)),
         2 => (0usize..100).prop_map(Act::GiveUp),
         4 => key().prop_map(Act::Pop),
@@ -289,6 +291,13 @@ proptest! {
                         tickets.push(ticket);
                     }
                 }
+                Act::Again(at, urgency) => if let Some(ticket) = chosen(at, &tickets) {
+                    let at = model.at(ticket.number, Stage::Begun);
+                    prop_assert_eq!(queue.wait_again(&ticket, urgency), at.is_some());
+                    if let Some(at) = at {
+                        (model.all[at].urgency, model.all[at].stage) = (urgency, Stage::Waits);
+                    }
+                },
                 Act::Finish(at, bytes) => if let Some(ticket) = chosen(at, &tickets) {
                     let at = model.at(ticket.number, Stage::Begun);
                     prop_assert_eq!(queue.finish(&ticket, bytes), at.is_some());

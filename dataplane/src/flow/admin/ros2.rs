@@ -13,6 +13,7 @@ use blaze_domain::{Scope, TopicName, WriterId};
 use serde_json::{Value, json};
 
 use super::super::Shared;
+use super::super::definitions::wait_for;
 use super::super::ros2::{Refusal, Ros2Scope, Seen};
 use super::{App, answer, query_text, refusal};
 use crate::control::ControlCore;
@@ -90,13 +91,11 @@ pub(super) async fn types(State(shared): App, query: Query<BTreeMap<String, Stri
         let detail = "the parameter type is missing: /v1/ros2/types?type=sensor_msgs/msg/Imu";
         return refusal(StatusCode::BAD_REQUEST, "invalid_request", detail);
     };
-    let types = Arc::clone(&shared.types);
     let sought = MessageType { name: name.clone(), hash: String::new() };
-    let found = tokio::task::spawn_blocking(move || types.find(sought.borrowed())).await;
-    let Some(found) = found.ok().flatten() else {
+    let Some(found) = wait_for(&shared.types, sought).await else {
         let detail = format!(
             "no definition of {name}: it is not built in, nor in a folder of brokers.plugins ros2 \
-             interfaces"
+             interfaces, and no node or flow has sent it"
         );
         return refusal(StatusCode::NOT_FOUND, "type_unknown", &detail);
     };

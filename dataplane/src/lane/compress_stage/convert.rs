@@ -3,7 +3,8 @@
 //! A message is converted once for each encoding, whatever the number of its bridges: small ones at
 //! once, large ones and those of a type that is yet to be found by the pool. What needs no
 //! conversion waits behind what does of the same writer and encoding, so its order is that of
-//! admission.
+//! admission. While others are asked for the definition of a type its messages wait, for some
+//! seconds at most.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -12,8 +13,7 @@ use blaze_domain::{DropReason, TopicName, WhyCode, WriterId};
 use blaze_proto::Frame;
 use smallvec::SmallVec;
 
-use super::{CodecJob, CodecTicket, Place};
-use crate::codec::order::Ticket;
+use super::{CodecJob, CodecTicket, CompressStage, ConvertTicket, Place};
 use crate::codec::pool::Urgency;
 use crate::codec::{Done, Work, guarded};
 use crate::lane::admit::Admitted;
@@ -30,6 +30,8 @@ const INLINE_BELOW: usize = 16 * 1024;
 const QUICK_BYTES: usize = 128 * 1024;
 /// Time between two events about one topic.
 const REPORT_EVERY: Duration = Duration::from_secs(1);
+/// How long a message waits while others are asked for the definition of its type.
+const LONGEST_SEARCH: Duration = Duration::from_secs(5);
 /// Failures that wait to be reported at most.
 const MAX_REPORTS: usize = 1_024;
 
@@ -119,6 +121,14 @@ fn step<'a>(info: &'a TopicInfo, frame: &'a Frame, to: Encoding) -> Step<'a> {
     }
 }
 
+fn urgency(bytes: usize) -> Urgency {
+    if bytes > QUICK_BYTES { Urgency::Long } else { Urgency::Quick }
+}
+
+fn is_unknown(done: &Done) -> bool {
+    matches!(done, Done::Converted(Err(failure)) if failure.code == WhyCode::TypeUnknown)
+}
+
 fn nameless() -> ConvertFailure {
     let detail = "neither the message nor its publisher names the type of the CDR";
     ConvertFailure::new(WhyCode::TypeUnknown, detail)
@@ -153,7 +163,8 @@ impl DataCore {
                 .map_err(|error| ConvertFailure::new(WhyCode::ConvertError, error.to_string())),
             Step::Fail(failure) => Err(failure),
             Step::Convert(ty) => {
-                let known = self.types.known(now, ty);
+                let is_sought = || self.types.is_sought(&ty.owned());
+                let known = self.types.known(now, ty).filter(|it| it.is_ok() || !is_sought());
                 if self.compress.enabled && (known.is_none() || bytes >= INLINE_BELOW) {
                     let ty = Some(ty.owned());
                     let frame = frame.clone();
@@ -202,8 +213,8 @@ impl DataCore {
         message: Converting,
         bytes: usize,
     ) {
-        let urgency = if bytes > QUICK_BYTES { Urgency::Long } else { Urgency::Quick };
         self.enter(line.0, &message);
+        let urgency = urgency(bytes);
         let pushed = self.compress.convert.push_waiting(line, urgency, message, bytes, usize::MAX);
         let refused = pushed.refused.map(|(message, _)| message);
         for message in pushed.gave_way.iter().chain(&refused) {
@@ -226,7 +237,7 @@ impl DataCore {
                 }
                 !is_late
             });
-            if let (false, Some(ty)) = (message.bridges.is_empty(), message.ty.take()) {
+            if let (false, Some(ty)) = (message.bridges.is_empty(), message.ty.clone()) {
                 let types = Arc::clone(&self.types);
                 return Some(CodecJob {
                     ticket: CodecTicket { place: Place::Convert(place) },
@@ -241,12 +252,10 @@ impl DataCore {
     }
 
     /// Takes the result of a job.
-    pub(super) fn finished_convert(
-        &mut self,
-        now: Instant,
-        place: &Ticket<TopicId, (WriterId, Encoding)>,
-        done: Done,
-    ) {
+    pub(super) fn finished_convert(&mut self, now: Instant, place: &ConvertTicket, done: Done) {
+        if is_unknown(&done) && self.wait_for_type(now, place) {
+            return;
+        }
         let (topic, (_, to)) = *place.key();
         let done = self.noted(topic, to, done);
         let Some(message) = self.compress.convert.begun(place) else { return };
@@ -265,6 +274,61 @@ impl DataCore {
             }
         }
         self.flush_convert(now, *place.key());
+    }
+
+    /// Lets a message wait while its type is sought with others. `false`: it is not, or has waited
+    /// for long enough.
+    fn wait_for_type(&mut self, now: Instant, place: &ConvertTicket) -> bool {
+        let Some(message) = self.compress.convert.begun(place) else { return false };
+        let Some(ty) = &message.ty else { return false };
+        if now.saturating_duration_since(message.came) >= LONGEST_SEARCH {
+            return false;
+        }
+        if self.types.is_sought(ty) {
+            self.compress.unknown.entry(ty.clone()).or_default().push(*place);
+            return true;
+        }
+        // It may have come since the pool looked.
+        let is_unknown = self.types.known(now, ty.borrowed()).is_some_and(|it| it.is_err());
+        !is_unknown && self.convert_again(place)
+    }
+
+    /// Converts messages whose types are not sought any more, and those that have waited for long
+    /// enough.
+    pub fn look_for_types(&mut self, now: Instant) {
+        let CompressStage { unknown, convert, .. } = &mut self.compress;
+        let types = &self.types;
+        let mut over = Vec::new();
+        unknown.retain(|ty, places| {
+            let is_sought = types.is_sought(ty);
+            let waits = |place: &ConvertTicket| {
+                let came = convert.begun(place).map(|message| message.came);
+                let is_early = |came| now.saturating_duration_since(came) < LONGEST_SEARCH;
+                is_sought && came.is_some_and(is_early)
+            };
+            let first = places.iter().position(waits).unwrap_or(places.len());
+            over.extend(places.drain(..first));
+            !places.is_empty()
+        });
+        for place in &over {
+            self.convert_again(place);
+        }
+    }
+
+    fn convert_again(&mut self, place: &ConvertTicket) -> bool {
+        let convert = &mut self.compress.convert;
+        let bytes = convert.begun(place).map_or(0, |message| message.frame.payload().len());
+        convert.wait_again(place, urgency(bytes))
+    }
+
+    /// Drops what waits for its type.
+    pub(super) fn give_up_unknown(&mut self, now: Instant) {
+        for place in std::mem::take(&mut self.compress.unknown).into_values().flatten() {
+            if let Some(message) = self.compress.convert.give_up(&place) {
+                self.refuse_to_convert(place.key().0, &message, DropReason::Shutdown);
+            }
+            self.flush_convert(now, *place.key());
+        }
     }
 
     /// Hands on what is next in a line.

@@ -2,6 +2,7 @@
 
 mod call;
 mod churn;
+mod definitions;
 mod direct;
 mod graph;
 mod long;

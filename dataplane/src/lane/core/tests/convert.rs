@@ -3,15 +3,18 @@
 
 mod property;
 
+use blaze_convert::{Distro, Source, TypeDescription, parse_joined};
 use blaze_domain::WhyCode;
+use tokio::sync::mpsc::{Receiver, channel};
 
 use super::*;
 use crate::codec::pool::Urgency;
 use crate::codec::{Done, guarded};
 use crate::lane::compress_stage::CodecJob;
-use crate::types::{MessageType, TopicTypes, Wanted};
+use crate::types::{MessageType, TopicTypes, Types, Wanted, Wish};
 
 const STRING: &str = "std_msgs/msg/String";
+const CUSTOM: &str = "my_msgs/msg/Level";
 const TWIST: &str = "geometry_msgs/msg/Twist";
 /// Converted by the pool.
 const LARGE: usize = 20_000;
@@ -249,6 +252,81 @@ fn a_message_is_converted_once_for_all_bridges_that_admit_it() {
     hands.publish(ros(1, "a"));
     let stats = hands.bench.core.path(hands.bench.topic).convert_stats;
     assert_eq!(stats.json, 0, "nobody asked for it");
+}
+
+/// A custom type that others are asked for; what they are asked stays in the queue.
+fn custom() -> (Hands, TypeDescription, Receiver<Wish>) {
+    let definition = parse_joined(CUSTOM, "int32 level\n", None).unwrap();
+    let (wishes, queue) = channel(8);
+    let mut hands = Hands::new(vec![copy(Scope::Node)], types(Some(CUSTOM), Wanted::Nothing));
+    let types = Types::new(Distro::Jazzy, Vec::new()).asking(wishes);
+    hands.bench.core.set_types(Arc::new(types));
+    hands.bench.core.enable_compression();
+    (hands, definition, queue)
+}
+
+fn level(sequence: u64, level: i32) -> Frame {
+    let cdr = [&[0, 1, 0, 0], &level.to_le_bytes()[..]].concat();
+    of("application/cdr", 1, sequence, cdr)
+}
+
+#[test]
+fn messages_wait_while_others_are_asked_for_their_type() {
+    let (mut hands, definition, mut queue) = custom();
+    for sequence in 1..=3 {
+        hands.publish(level(sequence, 7));
+        hands.run();
+    }
+    let types = Arc::clone(&hands.bench.core.types);
+    let ty = queue.try_recv().unwrap().ty;
+    assert!(queue.try_recv().is_err() && types.is_sought(&ty), "it is asked for once");
+    hands.publish(of("application/json", 1, 4, "{}"));
+    hands.bench.core.look_for_types(hands.bench.now);
+    assert!(!hands.bench.core.has_pool_requests(), "nobody works on them");
+    assert_eq!((hands.texts().len(), hands.dropped(0)), (0, Vec::new()));
+    types.add(Source::Node, definition).unwrap();
+    types.sought(&ty);
+    hands.bench.core.look_for_types(hands.bench.now);
+    hands.run();
+    assert_eq!(hands.texts(), [r#"{"level":7}"#, r#"{"level":7}"#, r#"{"level":7}"#, "{}"]);
+    hands.publish(level(5, 8));
+    assert_eq!(hands.texts()[4], r#"{"level":8}"#, "at once");
+}
+
+#[test]
+fn messages_wait_for_some_seconds_at_most() {
+    let (mut hands, _, mut queue) = custom();
+    let converts = |count| vec![(DropReason::ConvertError, count)];
+    hands.publish(level(1, 7));
+    hands.publish(level(2, 7));
+    hands.run();
+    let ty = queue.try_recv().unwrap().ty;
+    hands.bench.core.types.sought(&ty);
+    hands.bench.core.look_for_types(hands.bench.now);
+    hands.run();
+    assert_eq!(hands.dropped(0), converts(2), "nobody has it");
+    assert_eq!(hands.failure(0).0, WhyCode::TypeUnknown);
+    hands.publish(level(3, 7));
+    assert_eq!(hands.dropped(0), converts(3), "it was sought a moment ago");
+    hands.bench.now += Duration::from_secs(5);
+    hands.publish(level(4, 7));
+    hands.run();
+    hands.bench.now += Duration::from_secs(1);
+    hands.publish(level(5, 7));
+    hands.run();
+    assert!(hands.bench.core.types.is_sought(&ty));
+    hands.bench.now += Duration::from_secs(4);
+    hands.bench.core.look_for_types(hands.bench.now);
+    hands.run();
+    assert_eq!(hands.dropped(0), converts(4), "nobody answers");
+    let Bench { core, link, now, .. } = &mut hands.bench;
+    core.stop_compression(*now, link);
+    assert!(!core.compress.delays_any());
+    assert_eq!(
+        hands.dropped(0).iter().map(|(_, count)| count).sum::<u64>(),
+        5,
+        "what waits for its type is dropped with the pool"
+    );
 }
 
 #[test]

@@ -1,0 +1,120 @@
+//! Asks a ROS 2 node for a definition: the flow is a client of its `get_type_description`.
+
+use std::time::{Duration, Instant};
+
+use blaze_brokers::ros2::names::{Carries, RosName};
+use blaze_brokers::{Broker as _, Content, PublisherOptions, Received, SubscribeOptions};
+use blaze_convert::{DescriptionError, TypeDescription};
+use blaze_domain::names::ChannelName;
+use blaze_domain::{Origin, WriterId};
+use blaze_proto::{Frame, Header};
+
+use super::super::Shared;
+use super::super::plane::wall_ns;
+use super::super::ros2::{Ros2Scope, Seen};
+use super::agree;
+use crate::types::MessageType;
+use crate::types::media::cdr_of;
+
+const SERVICE: &str = "get_type_description";
+const REQUEST: &str = "type_description_interfaces/srv/GetTypeDescription_Request";
+/// How often a node is asked, and how long it has each time. The first request or reply may be
+/// lost, since client and server have to find each other.
+const TRIES: u64 = 4;
+const ANSWER: Duration = Duration::from_millis(1500);
+/// Replies that wait: to this client and others.
+const MAX_REPLIES: usize = 64;
+
+/// Nodes with endpoints of a type that have the service, each with the hash that it announces: one
+/// without (Humble) has no service. A node is asked for a name and a hash.
+pub(super) fn nodes_with(seen: &[Seen], ty: &MessageType) -> Vec<(String, MessageType)> {
+    let mut nodes: Vec<(String, MessageType)> = Vec::new();
+    for Seen { endpoint, .. } in seen {
+        let (Some(node), Some(hash)) = (&endpoint.node, &endpoint.type_hash) else { continue };
+        let is_it = endpoint.type_name.as_ref() == Some(&ty.name) && agree(hash, &ty.hash);
+        let of_type = MessageType { name: ty.name.clone(), hash: hash.clone() };
+        let is_known = nodes.iter().any(|(known, of)| known == node && *of == of_type);
+        if is_it && !is_known && serves(seen, node) {
+            nodes.push((node.clone(), of_type));
+        }
+    }
+    nodes
+}
+
+fn serves(seen: &[Seen], node: &str) -> bool {
+    let name = requests_of(node);
+    seen.iter().any(|seen| !seen.endpoint.is_writer && seen.endpoint.name == name)
+}
+
+/// The requests of a node's service.
+fn requests_of(node: &str) -> RosName {
+    let name = format!("{}/{SERVICE}", node.trim_start_matches('/'));
+    RosName { name, carries: Carries::Requests }
+}
+
+/// Asks a node; `None` where it does not answer, or does not know the type.
+pub(super) async fn ask(shared: &Shared, node: &str, ty: &MessageType) -> Option<TypeDescription> {
+    let ros2 = shared.ros2.as_ref()?;
+    match call(shared, ros2, node, ty).await {
+        Ok(description) => Some(description),
+        Err(error) => {
+            tracing::info!(node, r#type = ty.name, "{SERVICE}: {error:#}");
+            None
+        }
+    }
+}
+
+async fn call(
+    shared: &Shared,
+    ros2: &Ros2Scope,
+    node: &str,
+    ty: &MessageType,
+) -> anyhow::Result<TypeDescription> {
+    let requests = requests_of(node);
+    let replies = RosName { carries: Carries::Replies, ..requests.clone() };
+    let [topic, replies] = [requests, replies].map(|name| name.to_topic(&ros2.namespace));
+    let (topic, replies) = (topic?, replies?);
+    let options = SubscribeOptions { max_messages: MAX_REPLIES, ..SubscribeOptions::default() };
+    let mut replies = ros2.broker.subscribe(&ChannelName::from(&replies), options).await?;
+    let reliable = PublisherOptions { reliable: true, ..PublisherOptions::default() };
+    let requests = ros2.broker.publisher(&ChannelName::from(&topic), reliable)?;
+    let payload = TypeDescription::request(&ty.name, &ty.hash)?;
+    let origin = Origin {
+        layer: shared.me.layer.to_string(),
+        node: shared.me.node.to_string(),
+        service: "blaze".to_owned(),
+        instance: "0".to_owned(),
+        epoch: 0,
+    };
+    let writer = WriterId(rand::random());
+    let mut batch = Vec::new();
+    for sequence in 1..=TRIES {
+        let header = Header {
+            encoding: cdr_of(REQUEST),
+            reliable: true,
+            ..Header::new(topic.as_str(), origin.clone(), writer, sequence, wall_ns())
+        };
+        let frame = Frame::new(&header, payload.clone().into())?;
+        requests.publish(&frame, Some(Instant::now() + ANSWER));
+        let until = tokio::time::Instant::now() + ANSWER;
+        while let Ok(count) =
+            tokio::time::timeout_at(until, replies.receive(&mut batch, MAX_REPLIES)).await
+        {
+            anyhow::ensure!(count > 0, "the ROS 2 network has gone");
+            if let Some(reply) = batch.drain(..).find_map(|reply| reply_to(writer, reply)) {
+                return Ok(reply?);
+            }
+        }
+    }
+    anyhow::bail!("no answer to {TRIES} requests")
+}
+
+/// The reply to one of the own requests, whichever.
+fn reply_to(
+    writer: WriterId,
+    Received { content, .. }: Received,
+) -> Option<Result<TypeDescription, DescriptionError>> {
+    let Content::Frame(frame) = content else { return None };
+    let (to, _) = frame.related()?;
+    (to == writer).then(|| TypeDescription::from_response(frame.payload()))
+}
