@@ -32,8 +32,8 @@ pub struct FlowSpec {
     pub kafka: Option<(String, String)>,
     /// DDS domain of the layer scope, on loopback or its host's address.
     pub layer_domain: Option<u16>,
-    /// `ROS_DOMAIN_ID` of the ROS 2 network, on loopback.
-    pub ros2: Option<u16>,
+    /// `ROS_DOMAIN_ID` of the ROS 2 network, and its interface.
+    pub ros2: Option<(u16, Ipv4Addr)>,
     /// DDS domain of the inter scope, on loopback or its host's address.
     pub domain: Option<u16>,
     /// The host of a network that it runs on; absent = this machine.
@@ -97,7 +97,14 @@ impl FlowSpec {
     /// With the ROS 2 network of its host.
     #[must_use]
     pub fn on_ros2(mut self, domain: u16) -> Self {
-        self.ros2 = Some(domain);
+        self.ros2 = Some((domain, Ipv4Addr::LOCALHOST));
+        self
+    }
+
+    /// With the ROS 2 network that a host of a network is on, with others.
+    #[must_use]
+    pub fn on_ros2_of(mut self, host: &Host, domain: u16) -> Self {
+        self.ros2 = Some((domain, host.address));
         self
     }
 
@@ -141,8 +148,11 @@ impl FlowSpec {
                 "  layer: {{ dds: {{ domain: {domain}, interface: \"{listen}\" }} }}"
             );
         }
-        if let Some(domain) = self.ros2 {
-            let _ = writeln!(text, "  plugins: [{{ ros2: {{ domain: {domain} }} }}]");
+        if let Some((domain, interface)) = self.ros2 {
+            let _ = writeln!(
+                text,
+                "  plugins: [{{ ros2: {{ domain: {domain}, interface: \"{interface}\" }} }}]"
+            );
         }
         if let Some(domain) = self.domain {
             let peers = match (&self.host, &self.peers[..]) {

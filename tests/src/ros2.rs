@@ -4,6 +4,7 @@
 //! A [`Peer`] is a process with any number of nodes; its commands are those of
 //! `tests/peers/peer.py`.
 
+use std::net::Ipv4Addr;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
@@ -27,8 +28,6 @@ const START: Duration = Duration::from_secs(30);
 const ANSWER: Duration = Duration::from_secs(30);
 /// Room for the packet filters of a flow.
 const OPTIONS_ROOM: u32 = 131_072;
-/// Where DDS meets in a namespace: no other process has this loopback.
-const INTERFACE: &str = "127.0.0.1";
 
 /// The programs of a peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -123,7 +122,15 @@ pub fn open_loopback(host: &Host) -> anyhow::Result<()> {
     let namespace = &host.namespace;
     network::run(&format!("ip -n {namespace} link set lo multicast on"))?;
     network::run(&format!("ip -n {namespace} route add 224.0.0.0/4 dev lo"))?;
-    network::inside(namespace, || {
+    open_switch(host)
+}
+
+/// Readies a host of a network for ROS 2 on its switch.
+///
+/// # Errors
+/// When the system refuses.
+pub fn open_switch(host: &Host) -> anyhow::Result<()> {
+    network::inside(&host.namespace, || {
         // Older kernels give a sixth of it.
         const SETTING: &str = "/proc/sys/net/core/optmem_max";
         let room: u32 = std::fs::read_to_string(SETTING)?.trim().parse()?;
@@ -149,7 +156,15 @@ impl Peer {
     /// # Errors
     /// When its packages are not installed, or it does not start.
     pub fn start(release: Release, host: &Host, domain: u16) -> anyhow::Result<Self> {
-        Self::launch(release, host, domain, true)
+        Self::launch(release, host, Ipv4Addr::LOCALHOST, domain, true)
+    }
+
+    /// The same on the switch of a host.
+    ///
+    /// # Errors
+    /// As [`Peer::start`].
+    pub fn start_on_switch(release: Release, host: &Host, domain: u16) -> anyhow::Result<Self> {
+        Self::launch(release, host, host.address, domain, true)
     }
 
     /// The same, as one that sends no type objects: Cyclone DDS refuses those of Fast DDS 3 where
@@ -158,16 +173,22 @@ impl Peer {
     /// # Errors
     /// As [`Peer::start`].
     pub fn start_untyped(release: Release, host: &Host, domain: u16) -> anyhow::Result<Self> {
-        Self::launch(release, host, domain, false)
+        Self::launch(release, host, Ipv4Addr::LOCALHOST, domain, false)
     }
 
-    fn launch(release: Release, host: &Host, domain: u16, types: bool) -> anyhow::Result<Self> {
+    fn launch(
+        release: Release,
+        host: &Host,
+        interface: Ipv4Addr,
+        domain: u16,
+        types: bool,
+    ) -> anyhow::Result<Self> {
         let programs = Path::new(env!("CARGO_MANIFEST_DIR")).join("peers");
         let python = installed::path(&format!("ros/{}/bin/python", release.packages()))?;
         let folder = tempfile::tempdir()?;
         let profile = folder.path().join("fastdds.xml");
         let text = std::fs::read_to_string(programs.join("fastdds.xml"))?
-            .replace("INTERFACE", INTERFACE)
+            .replace("INTERFACE", &interface.to_string())
             .replace("TYPES", if types { "enabled" } else { "disabled" });
         std::fs::write(&profile, text)?;
         let mut command = network::program(Some(&host.namespace), python);
@@ -180,7 +201,7 @@ impl Peer {
             .env(
                 "CYCLONEDDS_URI",
                 format!(
-                    "<General><Interfaces><NetworkInterface address='{INTERFACE}' \
+                    "<General><Interfaces><NetworkInterface address='{interface}' \
                      multicast='true'/></Interfaces></General><Internal><SocketReceiveBufferSize \
                      min='4MB'/></Internal>"
                 ),

@@ -1,5 +1,6 @@
 //! ROS 2: rclpy and Cyclone DDS beside flows.
 
+mod brokers;
 mod call;
 mod churn;
 mod definitions;
@@ -9,4 +10,6 @@ mod long;
 mod quality;
 mod routes;
 mod services;
+mod shared;
 mod support;
+mod tools;

@@ -11,7 +11,7 @@ use blaze_tests::wan::Shape;
 /// `ROS_DOMAIN_ID` of both networks, which know nothing of each other.
 pub(super) const DOMAIN: u16 = 7;
 /// Domain of the link, within the namespaces.
-const LINK_DOMAIN: u16 = 50;
+pub(super) const LINK_DOMAIN: u16 = 50;
 /// For endpoints to meet, on a busy machine.
 pub(super) const MEET: Duration = Duration::from_secs(20);
 /// For messages to arrive, on a busy machine.
