@@ -205,7 +205,9 @@ impl Ros {
         let known_for = self.knowledge.replies_for(now, &replies);
         // Held until it is noted whose request it is: its reply may be read by then.
         let mut services = self.services.lock();
-        if !services.may_ask(now, &topic.name, &dds_replies, known_for) {
+        if !services.may_ask(now, &topic.name, &dds_replies, known_for)
+            || !services.has_room(now, &topic.name)
+        {
             return Ok(Written::Full);
         }
         let server = self.knowledge.server(&requests);
@@ -224,7 +226,7 @@ impl Ros {
             let request = (frame.writer(), frame.sequence());
             let flow = format!("{}/{}", frame.origin_layer(), frame.origin_node());
             let forwarded = Forwarded { request, flow };
-            services.note_forwarded(&topic.name, header.unwrap_or_else(on_wire), forwarded);
+            services.note_forwarded(now, &topic.name, header.unwrap_or_else(on_wire), forwarded);
         }
         Ok(written)
     }

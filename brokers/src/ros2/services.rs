@@ -32,6 +32,11 @@ const MAX_REQUESTS: usize = 65_536;
 const MEET_SERVER: Duration = Duration::from_millis(200);
 /// How long requests wait for that at most.
 const LONGEST_MEET: Duration = Duration::from_secs(5);
+/// Requests that a server has not answered and that were written not long ago: servers of ROS 2 keep
+/// ten, and lose the oldest of more.
+const MAX_BURST: usize = 8;
+/// How long one that is not answered counts as written not long ago.
+const BURST_PAUSE: Duration = Duration::from_millis(200);
 /// Bytes of the encapsulation, and of what Cyclone puts before requests and replies: who asks, and
 /// the number of the request.
 const ENCAPSULATION: usize = 4;
@@ -209,6 +214,8 @@ pub(super) struct State {
     readers: HashMap<String, ReplyReader>,
     /// DDS topics whose requests wait until their replies can be read, and since when.
     waiting: HashMap<String, Instant>,
+    /// By DDS topic: what was written last, and when.
+    burst: HashMap<String, Vec<(Instant, OnWire)>>,
     /// Requests that were given up because there were too many.
     given_up: u64,
     /// The last number given to a server that wants one before the CDR.
@@ -299,6 +306,15 @@ impl State {
         now.saturating_duration_since(*since) >= LONGEST_MEET
     }
 
+    /// Whether a server takes one more request of a topic now.
+    pub(super) fn has_room(&mut self, now: Instant, topic: &str) -> bool {
+        let Some(burst) = self.burst.get_mut(topic) else { return true };
+        burst.retain(|(at, known_as)| {
+            now.saturating_duration_since(*at) < BURST_PAUSE && self.by_wire.contains_key(known_as)
+        });
+        burst.len() < MAX_BURST
+    }
+
     /// The own reader of `replies`, as requests of a writer name it: servers of Fast DDS then wait
     /// until they have met it.
     pub(super) fn reader_to_name(
@@ -311,7 +327,14 @@ impl State {
     }
 
     /// A request was written here.
-    pub(super) fn note_forwarded(&mut self, topic: &str, known_as: OnWire, of: Forwarded) {
+    pub(super) fn note_forwarded(
+        &mut self,
+        now: Instant,
+        topic: &str,
+        known_as: OnWire,
+        of: Forwarded,
+    ) {
+        self.burst.entry(topic.to_owned()).or_default().push((now, known_as));
         let gone = self.forwarded.insert(of.request, (known_as, topic.to_owned()));
         self.given_up += gone.len() as u64;
         self.forget(gone);
@@ -334,6 +357,7 @@ impl State {
     ) {
         self.asked.retain(|(client, _), _| is_client(client));
         self.waiting.retain(|topic, _| is_served(topic));
+        self.burst.retain(|topic, _| is_served(topic));
         let gone = self.forwarded.retain(|_, (_, topic)| is_served(topic));
         self.forget(gone);
     }
@@ -382,7 +406,8 @@ mod tests {
         let mut state = State::default();
         let wire = |number| OnWire::Related([9; 16], number);
         for number in 1..=3_u64 {
-            state.note_forwarded("rq/addRequest", wire(number as i64), forwarded(number));
+            let known_as = wire(number as i64);
+            state.note_forwarded(Instant::now(), "rq/addRequest", known_as, forwarded(number));
         }
         assert_eq!(state.take_forwarded(&wire(2)), Some(forwarded(2)));
         assert_eq!(state.take_forwarded(&wire(2)), None, "a server may answer once");
@@ -421,6 +446,25 @@ mod tests {
         assert_eq!(state.reader_to_name(TOPICS[1], [8; 16]), Some([1; 16]));
         state.note_reader(begin, TOPICS[1], [1; 16], false);
         assert_eq!(state.reader_to_name(TOPICS[1], [8; 16]), None);
+    }
+
+    #[test]
+    fn a_server_gets_no_more_requests_at_once_than_it_keeps() {
+        const TOPIC: &str = "rq/addRequest";
+        let (begin, mut state) = (Instant::now(), State::default());
+        let wire = |number| OnWire::Related([9; 16], number);
+        for number in 1..=MAX_BURST as u64 {
+            assert!(state.has_room(begin, TOPIC));
+            state.note_forwarded(begin, TOPIC, wire(number as i64), forwarded(number));
+        }
+        assert!(!state.has_room(begin, TOPIC) && state.has_room(begin, "rq/otherRequest"));
+        state.take_forwarded(&wire(3)).unwrap();
+        assert!(state.has_room(begin, TOPIC), "one is answered");
+        state.note_forwarded(begin, TOPIC, wire(20), forwarded(20));
+        assert!(!state.has_room(begin, TOPIC));
+        assert!(state.has_room(begin + BURST_PAUSE, TOPIC), "some take long");
+        state.retain(|_| true, |_| false);
+        assert!(state.burst.is_empty());
     }
 
     #[test]
