@@ -32,10 +32,10 @@ const MAX_WISHES: usize = 256;
 /// Wishes that are looked after at once.
 const TASKS: usize = 8;
 /// How often a flow is asked, and how long it has each time. It may have to ask a node first.
-const TRIES: usize = 5;
+const TRIES: usize = 6;
 const ANSWER: Duration = Duration::from_secs(2);
 /// How long somebody waits who asks for a definition by HTTP.
-const LONGEST_SEARCH: Duration = Duration::from_secs(10);
+const LONGEST_SEARCH: Duration = Duration::from_secs(15);
 /// Longest name of a type in a request, and longest hash.
 const MAX_NAME: usize = 255;
 const MAX_HASH: usize = 80;
@@ -182,8 +182,11 @@ impl Shared {
 struct Around<'a>(&'a Shared);
 
 impl Others for Around<'_> {
-    fn nodes(&self, ty: &MessageType) -> Vec<(String, MessageType)> {
-        self.0.ros2.as_ref().map_or_else(Vec::new, |ros2| node::nodes_with(&ros2.seen(), ty))
+    async fn nodes(&self, ty: &MessageType) -> Vec<(String, MessageType)> {
+        match &self.0.ros2 {
+            Some(ros2) => node::nodes_with(ros2, ty).await,
+            None => Vec::new(),
+        }
     }
 
     /// Those that own publishers of the type on a ROS 2 network first. On behalf of another layer

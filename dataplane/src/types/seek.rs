@@ -20,8 +20,8 @@ pub struct Wish {
 /// Those who may have definitions.
 pub(crate) trait Others {
     /// Nodes of the own ROS 2 network with endpoints of a type, and the hash of each: a node is
-    /// asked for both.
-    fn nodes(&self, ty: &MessageType) -> Vec<(String, MessageType)>;
+    /// asked for both. Waits a moment for nodes that are not known yet.
+    async fn nodes(&self, ty: &MessageType) -> Vec<(String, MessageType)>;
 
     /// Flows that may have the definition.
     fn flows(&self, wish: &Wish) -> Vec<FlowId>;
@@ -36,7 +36,7 @@ pub(crate) trait Others {
 /// Seeks a definition with others, and adds it to what this flow has. What is not of the name and
 /// hash is passed over.
 pub(crate) async fn seek(types: &Types, others: &impl Others, wish: &Wish) -> Option<Source> {
-    for (node, ty) in others.nodes(&wish.ty).into_iter().take(MAX_ASKED) {
+    for (node, ty) in others.nodes(&wish.ty).await.into_iter().take(MAX_ASKED) {
         let found = others.ask_node(&node, &ty).await;
         if found.is_some_and(|found| add(types, Source::Node, &node, &ty, found)) {
             return Some(Source::Node);
@@ -116,7 +116,7 @@ mod tests {
     }
 
     impl Others for Fakes {
-        fn nodes(&self, ty: &MessageType) -> Vec<(String, MessageType)> {
+        async fn nodes(&self, ty: &MessageType) -> Vec<(String, MessageType)> {
             let of = |hash: &String| MessageType { name: ty.name.clone(), hash: hash.clone() };
             self.nodes.iter().map(|(node, hash)| ((*node).to_owned(), of(hash))).collect()
         }

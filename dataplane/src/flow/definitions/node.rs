@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use blaze_brokers::ros2::RosEndpoint;
 use blaze_brokers::ros2::names::{Carries, RosName};
 use blaze_brokers::{Broker as _, Content, PublisherOptions, Received, SubscribeOptions};
 use blaze_convert::{DescriptionError, TypeDescription};
@@ -22,28 +23,57 @@ const REQUEST: &str = "type_description_interfaces/srv/GetTypeDescription_Reques
 /// lost, since client and server have to find each other.
 const TRIES: u64 = 4;
 const ANSWER: Duration = Duration::from_millis(1500);
+/// How long an endpoint's node and service may take to be known, and how often that is looked at.
+const MEET: Duration = Duration::from_secs(5);
+const LOOK: Duration = Duration::from_millis(50);
 /// Replies that wait: to this client and others.
 const MAX_REPLIES: usize = 64;
 
-/// Nodes with endpoints of a type that have the service, each with the hash that it announces: one
-/// without (Humble) has no service. A node is asked for a name and a hash.
-pub(super) fn nodes_with(seen: &[Seen], ty: &MessageType) -> Vec<(String, MessageType)> {
-    let mut nodes: Vec<(String, MessageType)> = Vec::new();
-    for Seen { endpoint, .. } in seen {
-        let (Some(node), Some(hash)) = (&endpoint.node, &endpoint.type_hash) else { continue };
-        let is_it = endpoint.type_name.as_ref() == Some(&ty.name) && agree(hash, &ty.hash);
-        let of_type = MessageType { name: ty.name.clone(), hash: hash.clone() };
-        let is_known = nodes.iter().any(|(known, of)| known == node && *of == of_type);
-        if is_it && !is_known && serves(seen, node) {
-            nodes.push((node.clone(), of_type));
+/// Nodes with endpoints of a type that have the service. An endpoint may be known before its node
+/// and the service are.
+pub(super) async fn nodes_with(ros2: &Ros2Scope, ty: &MessageType) -> Vec<(String, MessageType)> {
+    let until = Instant::now() + MEET;
+    loop {
+        let (has_endpoint, nodes) = look(&ros2.seen(), ty);
+        if !has_endpoint || !nodes.is_empty() || Instant::now() >= until {
+            return nodes;
         }
+        tokio::time::sleep(LOOK).await;
     }
-    nodes
 }
 
-fn serves(seen: &[Seen], node: &str) -> bool {
-    let name = requests_of(node);
-    seen.iter().any(|seen| !seen.endpoint.is_writer && seen.endpoint.name == name)
+/// Whether there are endpoints of a type, and their nodes that have the service, each with the hash
+/// that it announces: one without (Humble) has no service.
+fn look(seen: &[Seen], ty: &MessageType) -> (bool, Vec<(String, MessageType)>) {
+    let (mut has_endpoint, mut nodes) = (false, Vec::new());
+    for Seen { endpoint, .. } in seen {
+        let Some(hash) = &endpoint.type_hash else { continue };
+        if endpoint.type_name.as_ref() != Some(&ty.name) || !agree(hash, &ty.hash) {
+            continue;
+        }
+        has_endpoint = true;
+        for node in servers(seen, endpoint) {
+            let of = (node, MessageType { name: ty.name.clone(), hash: hash.clone() });
+            if !nodes.contains(&of) {
+                nodes.push(of);
+            }
+        }
+    }
+    (has_endpoint, nodes)
+}
+
+/// The node of an endpoint, if it has the service. While the node is not told, all nodes of its
+/// participant: that is mostly one.
+fn servers(seen: &[Seen], endpoint: &RosEndpoint) -> impl Iterator<Item = String> {
+    let of_participant = seen.iter().map(|seen| &*seen.endpoint).filter(|other| {
+        !other.is_writer
+            && other.name.carries == Carries::Requests
+            && other.id[..12] == endpoint.id[..12]
+    });
+    of_participant.filter_map(|server| {
+        let node = format!("/{}", server.name.name.strip_suffix(SERVICE)?.strip_suffix('/')?);
+        endpoint.node.as_ref().is_none_or(|own| *own == node).then_some(node)
+    })
 }
 
 /// The requests of a node's service.

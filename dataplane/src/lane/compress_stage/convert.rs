@@ -31,7 +31,7 @@ const QUICK_BYTES: usize = 128 * 1024;
 /// Time between two events about one topic.
 const REPORT_EVERY: Duration = Duration::from_secs(1);
 /// How long a message waits while others are asked for the definition of its type.
-const LONGEST_SEARCH: Duration = Duration::from_secs(5);
+const LONGEST_SEARCH: Duration = Duration::from_secs(10);
 /// Failures that wait to be reported at most.
 const MAX_REPORTS: usize = 1_024;
 

@@ -315,7 +315,7 @@ fn messages_wait_for_some_seconds_at_most() {
     hands.publish(level(5, 7));
     hands.run();
     assert!(hands.bench.core.types.is_sought(&ty));
-    hands.bench.now += Duration::from_secs(4);
+    hands.bench.now += Duration::from_secs(9);
     hands.bench.core.look_for_types(hands.bench.now);
     hands.run();
     assert_eq!(hands.dropped(0), converts(4), "nobody answers");
