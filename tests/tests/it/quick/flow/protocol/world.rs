@@ -499,6 +499,8 @@ impl<'a> Simulation<'a> {
                 Output::Publish { .. }
                 | Output::LayerScope { .. }
                 | Output::LayerAway(_)
+                | Output::Types { .. }
+                | Output::Call { .. }
                 | Output::Ros2(_)
                 | Output::Owned(_)
                 | Output::Show { .. }
