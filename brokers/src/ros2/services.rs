@@ -36,7 +36,7 @@ const LONGEST_MEET: Duration = Duration::from_secs(5);
 /// ten, and lose the oldest of more.
 const MAX_BURST: usize = 8;
 /// How long one that is not answered counts as written not long ago.
-const BURST_PAUSE: Duration = Duration::from_secs(2);
+const BURST_PAUSE: Duration = Duration::from_millis(200);
 /// Bytes of the encapsulation, and of what Cyclone puts before requests and replies: who asks, and
 /// the number of the request.
 const ENCAPSULATION: usize = 4;
