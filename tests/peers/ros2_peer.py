@@ -122,7 +122,9 @@ class Ros2Peer(peer.Peer):
 
     def op_client(self, name, node, service, type) -> dict:
         end, node = self.end(name, node, type)
-        end.client = node.create_client(peer.found(type), service)
+        # Each client gets the replies to all of its node, and by default keeps ten of them.
+        kept = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
+        end.client = node.create_client(peer.found(type), service, qos_profile=kept)
         end.available = end.client.service_is_ready
         end.destroy = lambda: node.destroy_client(end.client)
         return {}
