@@ -58,8 +58,8 @@ impl AllShown {
         true
     }
 
-    /// Makes the idle reader or writer of a topic, or one that offers what readers ask for now; ends the one
-    /// that is not needed beside those of `offers`.
+    /// Makes the idle reader or writer of a topic, or one that offers what readers ask for now; ends
+    /// the one that is not needed beside those of `offers`.
     pub(super) fn follow<'a>(
         &mut self,
         inner: &Inner,
