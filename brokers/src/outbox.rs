@@ -403,8 +403,20 @@ impl<C> Outbox<C> {
 }
 
 impl<C> Lane<C> {
-    /// Queues a message; the oldest of the lane give way.
+    /// Queues a message, and tells whoever takes.
+    #[cfg(test)]
     pub(crate) fn push(&self, body: Body, deadline: Option<Instant>) -> PublishOutcome {
+        self.push_unless(body, deadline, || false)
+    }
+
+    /// Queues a message; the oldest of the lane give way. Whoever takes is told if nothing of the
+    /// lane waited, unless `is_seen_to` sees to it at once.
+    pub(crate) fn push_unless(
+        &self,
+        body: Body,
+        deadline: Option<Instant>,
+        is_seen_to: impl FnOnce() -> bool,
+    ) -> PublishOutcome {
         let since = Instant::now();
         let longest = self.longest_wait.map(|wait| (since + wait, DropReason::BrokerError));
         let expires = match (deadline.map(|at| (at, DropReason::Lifespan)), longest) {
@@ -444,7 +456,9 @@ impl<C> Lane<C> {
             }
             state.turns.push_back(self.id);
         }
-        self.outbox.filled.notify_one();
+        if !is_seen_to() {
+            self.outbox.filled.notify_one();
+        }
         PublishOutcome::Taken
     }
 
@@ -471,6 +485,11 @@ pub(crate) trait Admission: Send + Sync {
     /// A message has been queued; it may have been shut meanwhile.
     fn queued(&self) {}
 
+    /// Takes what is queued in this thread. Returns whether nobody else has to.
+    fn takes_at_once(&self) -> bool {
+        false
+    }
+
     /// Whether the server keeps headers beside the payload.
     fn has_headers(&self) -> bool {
         false
@@ -491,7 +510,7 @@ impl<C, A: Admission> LanePublisher<C, A> {
         if payload_bytes > MAX_PAYLOAD_BYTES {
             return PublishOutcome::TooLarge;
         }
-        let outcome = self.lane.push(body, deadline);
+        let outcome = self.lane.push_unless(body, deadline, || self.admission.takes_at_once());
         self.admission.queued();
         outcome
     }

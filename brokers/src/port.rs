@@ -11,8 +11,8 @@
 
 use std::collections::VecDeque;
 use std::fmt;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use async_trait::async_trait;
@@ -489,11 +489,41 @@ pub trait FlowSide: Send + Sync {
     fn stand_back(&self, for_whom: Option<String>);
 }
 
+/// Takes messages of a subscription, and how many were dropped before them because nobody took
+/// them in time.
+pub type MessageSink = Box<dyn Fn(&mut Vec<Received>, u64) + Send + Sync>;
+
 struct Ring {
     queue: Mutex<RingState>,
     readable: Notify,
     dropped: AtomicU64,
     options: SubscribeOptions,
+    forward: OnceLock<Forward>,
+}
+
+/// Where messages go that nobody waits for.
+struct Forward {
+    sink: MessageSink,
+    /// Messages that it takes at once.
+    limit: usize,
+    /// Who holds it calls the sink, so that messages stay in order.
+    batch: Mutex<Vec<Received>>,
+}
+
+impl Ring {
+    /// Gives the sink what waits. Where another thread does so, that one takes this, too. Returns
+    /// whether there is a sink.
+    fn forward(&self) -> bool {
+        let Some(forward) = self.forward.get() else { return false };
+        while !self.queue.lock().messages.is_empty() {
+            let Some(mut batch) = forward.batch.try_lock() else { break };
+            while self.queue.lock().take(&mut batch, forward.limit) > 0 {
+                (forward.sink)(&mut batch, self.dropped.swap(0, Ordering::Relaxed));
+                batch.clear();
+            }
+        }
+        true
+    }
 }
 
 #[derive(Default)]
@@ -580,6 +610,7 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
         readable: Notify::new(),
         dropped: AtomicU64::new(0),
         options,
+        forward: OnceLock::new(),
     });
     (SubscriptionSender { ring: Arc::clone(&ring) }, Subscription { ring, starts: Vec::new() })
 }
@@ -597,7 +628,26 @@ impl SubscriptionSender {
         self.hand_over(kept, true)
     }
 
+    /// As [`send`](Self::send), for one who calls [`flush`](Self::flush) soon.
+    pub(crate) fn put(&self, message: Received) -> bool {
+        self.push([message], false)
+    }
+
+    /// Hands over what was put: in this thread, where the reader has a sink. Called without any lock
+    /// that a sink might want.
+    pub(crate) fn flush(&self) {
+        if !self.ring.forward() && !self.ring.queue.lock().messages.is_empty() {
+            self.ring.readable.notify_one();
+        }
+    }
+
     fn hand_over(&self, messages: impl IntoIterator<Item = Received>, raise_bounds: bool) -> bool {
+        let lives = self.push(messages, raise_bounds);
+        self.ring.readable.notify_one();
+        lives
+    }
+
+    fn push(&self, messages: impl IntoIterator<Item = Received>, raise_bounds: bool) -> bool {
         let mut lost = 0;
         {
             let mut state = self.ring.queue.lock();
@@ -612,7 +662,6 @@ impl SubscriptionSender {
             }
         }
         self.note_lost(lost);
-        self.ring.readable.notify_one();
         true
     }
 
@@ -676,6 +725,20 @@ impl Subscription {
         }
     }
 
+    /// Gives messages to a sink until the subscription ends, up to `limit` at once. Some adapters
+    /// call it in the thread that reads, so that nobody has to be woken; it must not wait for
+    /// anything, nor drop the subscription. After that is dropped, it is not called any more.
+    pub async fn forward(&mut self, limit: usize, sink: MessageSink) {
+        let _ = self.ring.forward.set(Forward { sink, limit, batch: Mutex::default() });
+        loop {
+            self.ring.forward();
+            if self.ring.queue.lock().closed {
+                return;
+            }
+            self.ring.readable.notified().await;
+        }
+    }
+
     /// Messages dropped because this reader, or whoever reads for it, was slow, since the last
     /// call.
     #[must_use]
@@ -690,11 +753,18 @@ impl Drop for Subscription {
         state.closed = true;
         state.messages.clear();
         state.bytes = 0;
+        drop(state);
+        if let Some(forward) = self.ring.forward.get() {
+            // Until then its sink may be called.
+            drop(forward.batch.lock());
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::thread;
+
     use futures::FutureExt as _;
 
     use super::*;
@@ -758,5 +828,86 @@ mod tests {
         sender.send_kept((0..MAX_KEPT_MESSAGES + 3).map(message));
         assert_eq!(subscription.take_dropped(), 2);
         assert_eq!(take(&mut subscription, usize::MAX).len(), MAX_KEPT_MESSAGES + 1);
+    }
+
+    /// A subscription with a sink, which notes the first bytes, what was lost, and its thread.
+    type Noted = Arc<Mutex<Vec<(Vec<u8>, u64, thread::ThreadId)>>>;
+
+    fn forwarding(
+        max_messages: usize,
+    ) -> (SubscriptionSender, impl Future<Output = ()> + Send, Noted) {
+        let (sender, mut subscription) = bounded(max_messages, usize::MAX);
+        let noted = Noted::default();
+        let notes = Arc::clone(&noted);
+        let sink = move |batch: &mut Vec<Received>, lost| {
+            let first = batch.iter().map(|received| match &received.content {
+                Content::Bare { payload, .. } => payload[0],
+                other => panic!("{other:?}"),
+            });
+            notes.lock().push((first.collect(), lost, thread::current().id()));
+        };
+        (sender, async move { subscription.forward(2, Box::new(sink)).await }, noted)
+    }
+
+    #[test]
+    fn a_sink_is_called_where_messages_are_put() {
+        let (sender, forward, noted) = forwarding(3);
+        let mut forward = Box::pin(forward);
+        assert!((&mut forward).now_or_never().is_none());
+        for number in 0..4 {
+            assert!(sender.send(message(number)));
+        }
+        assert!((&mut forward).now_or_never().is_none());
+        let other = thread::scope(|scope| {
+            let flush = || {
+                sender.put(message(4));
+                sender.flush();
+                thread::current().id()
+            };
+            scope.spawn(flush).join().unwrap()
+        });
+        let here = thread::current().id();
+        let expected = [(vec![1, 2], 1, here), (vec![3], 0, here), (vec![4], 0, other)];
+        assert_eq!(*noted.lock(), expected);
+        sender.send(message(5));
+        sender.close();
+        assert!(forward.now_or_never().is_some());
+        assert_eq!(noted.lock()[3], (vec![5], 0, here));
+    }
+
+    #[test]
+    fn without_a_reader_a_sink_gets_nothing() {
+        let (sender, forward, noted) = forwarding(3);
+        let mut forward = Box::pin(forward);
+        assert!((&mut forward).now_or_never().is_none());
+        sender.put(message(1));
+        drop(forward);
+        sender.flush();
+        assert!(noted.lock().is_empty() && !sender.put(message(2)));
+    }
+
+    #[test]
+    fn a_sink_gets_messages_of_each_thread_in_order() {
+        const EACH: u8 = 200;
+        let (sender, forward, noted) = forwarding(10_000);
+        let mut forward = Box::pin(forward);
+        assert!((&mut forward).now_or_never().is_none());
+        thread::scope(|scope| {
+            for offset in [0_u8, 1] {
+                let sender = &sender;
+                scope.spawn(move || {
+                    for number in 0..EACH / 2 {
+                        sender.put(message(usize::from(2 * number + offset)));
+                        sender.flush();
+                    }
+                });
+            }
+        });
+        let noted = noted.lock();
+        let all: Vec<u8> = noted.iter().flat_map(|(numbers, ..)| numbers.iter().copied()).collect();
+        for offset in [0, 1] {
+            let of_thread: Vec<u8> = all.iter().copied().filter(|it| it % 2 == offset).collect();
+            assert_eq!(of_thread, (0..EACH).filter(|it| it % 2 == offset).collect::<Vec<u8>>());
+        }
     }
 }

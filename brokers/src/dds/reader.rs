@@ -56,12 +56,10 @@ impl Reader {
         let thread = StoppableThread::start("dds-reader", failed, move |stop| {
             let waker = unpark_waker();
             while !stop.load(Ordering::Relaxed) {
-                drain(&reader, &sink, &counter);
+                // Before it is emptied: what comes before a waker is set wakes nobody.
                 reader.set_waker(Some(waker.clone()));
-                // What came before the waker was set woke nobody.
-                if !drain(&reader, &sink, &counter) {
-                    thread::park_timeout(LONGEST_SLEEP);
-                }
+                drain(&reader, &sink, &counter);
+                thread::park_timeout(LONGEST_SLEEP);
             }
         })?;
         Ok(Self { thread, malformed })
@@ -80,17 +78,14 @@ impl Reader {
     }
 }
 
-/// Takes what is there. Returns whether there was anything.
-fn drain(reader: &RawReader, sink: &SampleSink, malformed: &AtomicU64) -> bool {
-    let mut any = false;
+/// Takes what is there.
+fn drain(reader: &RawReader, sink: &SampleSink, malformed: &AtomicU64) {
     take_up_to(reader, usize::MAX, |taken| {
-        any = true;
         // The encoding of an error is none of CDR.
         if !taken.is_ok_and(sink) {
             malformed.fetch_add(1, Ordering::Relaxed);
         }
     });
-    any
 }
 
 /// Takes samples as long as there are any, at most `limit`. Returns whether there may be more.

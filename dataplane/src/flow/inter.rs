@@ -200,9 +200,12 @@ impl InterScope {
         }
         self.plane.say_goodbye();
         std::thread::sleep(GOODBYE);
-        // The pacer may still hold it for the datagram that it sends. Its end takes a while, in
-        // which nobody is to wait for it.
+        // Others may still hold it for the datagram that they send. Its end takes a while, and is
+        // not to come in a thread of the transport.
         let gone = self.transport.lock().take();
+        while gone.as_ref().is_some_and(|gone| Arc::strong_count(gone) > 1) {
+            std::thread::sleep(LOOK);
+        }
         drop(gone);
         self.plane.drop_peers();
     }

@@ -270,7 +270,8 @@ pub async fn start_with(
         inter.join()?;
     }
     let control = ControlCore::new(config, now);
-    let egress = Egress::new(settings.live.bandwidth.limit_bytes_per_s());
+    let limit = settings.live.bandwidth.limit_bytes_per_s();
+    let egress = Egress::new(limit, inter.as_ref().map(InterScope::wire));
     let readiness = readiness(&brokers, inter.is_some());
     let in_doubt = doubt.is_some();
     if let Some(doubt) = doubt {
@@ -483,6 +484,13 @@ fn start_inter(shared: &Arc<Shared>, supervisor: &Supervisor) -> anyhow::Result<
             inter.run();
         }
     })?;
+    let sends = Arc::downgrade(shared);
+    shared.plane.send_by(Box::new(move |plane| {
+        sends.upgrade().is_some_and(|shared| {
+            let inter = shared.inter.as_ref();
+            inter.is_some_and(|inter| shared.egress.send_at_once(plane, inter))
+        })
+    }));
     let shared = Arc::clone(shared);
     let run = move || {
         if let Some(inter) = &shared.inter {

@@ -1,8 +1,13 @@
-//! The thread that lets datagrams out: the only one that sends on the inter scope.
+//! Lets datagrams out on the inter scope, within the budget.
+//!
+//! Whoever brings a message sends it, too, where nothing waits and the budget allows it. What has to
+//! wait is sent by the pacer, a thread. Only who holds the pacer's lock sends, so that datagrams
+//! leave in the order in which they were made.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use blaze_domain::{LayerName, Priority};
@@ -13,8 +18,12 @@ use super::plane::{Next, Plane};
 use crate::lane::measure::RateMeter;
 use crate::limit::pacer::{BURST_DATAGRAMS, Pacer};
 use crate::limit::wire_factor::MAX_LAYERS;
+use crate::link::Transmit;
+use crate::link::dds::Wire;
 use crate::link::transport::SendOutcome;
 
+/// Datagrams that leave in one turn, so that nobody sends for others for long.
+const TURN: usize = 32;
 /// The pacer wakes at least that often, to notice a new limit or the end.
 const IDLE: Duration = Duration::from_millis(100);
 /// A debt from which on LinkControl is let out all the same; shorter ones delay it by no more than
@@ -27,6 +36,22 @@ pub struct Egress {
     budget: AtomicU64,
     stop: AtomicBool,
     traffic: Mutex<Traffic>,
+    sender: Mutex<Sender>,
+}
+
+/// Who holds it sends.
+struct Sender {
+    pacer: Pacer,
+    /// When the pacer's thread comes back by itself.
+    comes_back: Instant,
+}
+
+/// When there is something to do again.
+enum Pause {
+    /// When a debt is paid, or a little later.
+    Debt(Instant),
+    /// Then, or when something else is to be sent.
+    Idle(Instant),
 }
 
 /// Wire bytes that have left.
@@ -54,13 +79,17 @@ pub struct LayerTraffic {
 }
 
 impl Egress {
-    /// An egress with a budget in wire bytes per second.
+    /// An egress with a budget in wire bytes per second, for datagrams of this size.
     #[must_use]
-    pub fn new(bytes_per_s: f64) -> Arc<Self> {
+    pub(super) fn new(bytes_per_s: f64, wire: Option<Wire>) -> Arc<Self> {
+        let now = Instant::now();
+        let largest = wire.map_or(0, |wire| wire.bytes(wire.max_datagram_bytes()));
+        let pacer = Pacer::new(bytes_per_s, BURST_DATAGRAMS * largest, now);
         Arc::new(Self {
             budget: AtomicU64::new(bytes_per_s.to_bits()),
             stop: AtomicBool::new(false),
             traffic: Mutex::default(),
+            sender: Mutex::new(Sender { pacer, comes_back: now }),
         })
     }
 
@@ -88,52 +117,89 @@ impl Egress {
 
     /// The thread: sends until it is stopped.
     pub(super) fn run(&self, plane: &Plane, inter: &InterScope) {
-        let start = Instant::now();
-        let wire = inter.wire();
-        let burst = BURST_DATAGRAMS * wire.bytes(wire.max_datagram_bytes());
-        let mut pacer = Pacer::new(self.budget(), burst, start);
+        plane.pace_by_this_thread();
         while !self.stop.load(Ordering::Relaxed) {
+            let pause = {
+                let mut sender = self.sender.lock();
+                let pause = self.turn(&mut sender.pacer, plane, inter);
+                sender.comes_back = pause.until();
+                pause
+            };
+            let time = pause.until().saturating_duration_since(Instant::now());
+            match pause {
+                // What comes meanwhile has to wait all the same.
+                Pause::Debt(_) => thread::sleep(time),
+                Pause::Idle(_) => thread::park_timeout(time),
+            }
+        }
+    }
+
+    /// Sends what may leave now, if nobody else does. Returns whether the pacer must come back
+    /// earlier than it would.
+    pub(super) fn send_at_once(&self, plane: &Plane, inter: &InterScope) -> bool {
+        self.sender.try_lock().is_none_or(|mut sender| {
+            let pause = self.turn(&mut sender.pacer, plane, inter);
+            pause.until() < sender.comes_back
+        })
+    }
+
+    /// Sends what may leave now, at most [`TURN`] datagrams.
+    fn turn(&self, pacer: &mut Pacer, plane: &Plane, inter: &InterScope) -> Pause {
+        for _ in 0..TURN {
             let now = Instant::now();
             let budget = self.budget();
             if (budget - pacer.limit()).abs() > f64::EPSILON {
                 pacer.set_limit(budget, now);
             }
-            let wait = pacer.wait(now);
+            let debt = pacer.wait(now);
             // Data waits off a debt. LinkControl does not, where that is long: peers would think
             // this flow dead.
-            let transmit = if wait.is_zero() {
-                match plane.next_transmit(IDLE) {
-                    Next::Datagram(transmit) => Some(transmit),
-                    Next::HeldBack => None,
-                    Next::Nothing => {
-                        pacer.rest(now);
-                        None
-                    }
-                }
+            let next = if debt.is_zero() {
+                plane.next_transmit()
+            } else if debt > LONG_DEBT {
+                plane.next_control()
             } else {
-                let control = if wait > LONG_DEBT { plane.next_control() } else { None };
-                if control.is_none() {
-                    std::thread::sleep(wait.min(IDLE));
-                }
-                control
+                return Pause::Debt(now + debt);
             };
-            let Some(transmit) = transmit else { continue };
-            let wire_bytes = wire.bytes(transmit.datagram.len());
-            let outcome = inter.send(&transmit.to, transmit.class, &transmit.datagram);
-            let now = Instant::now();
-            pacer.spend(wire_bytes, now);
-            let mut traffic = self.traffic.lock();
-            traffic.add(
-                now,
-                &transmit.to.flow.layer,
-                transmit.class,
-                wire_bytes as u64,
-                transmit.control,
-            );
-            if outcome == SendOutcome::NotSent {
-                traffic.not_sent += 1;
+            match next {
+                Next::Datagram(transmit) => self.send(pacer, &transmit, inter),
+                Next::Nothing { .. } if !debt.is_zero() => {
+                    return Pause::Debt(now + debt.min(IDLE));
+                }
+                Next::Nothing { due, is_held_back } => {
+                    if !is_held_back {
+                        pacer.rest(now);
+                    }
+                    return Pause::Idle(due.into_iter().fold(now + IDLE, Instant::min));
+                }
             }
         }
+        Pause::Idle(Instant::now())
+    }
+
+    fn send(&self, pacer: &mut Pacer, transmit: &Transmit, inter: &InterScope) {
+        let wire_bytes = inter.wire().bytes(transmit.datagram.len());
+        let outcome = inter.send(&transmit.to, transmit.class, &transmit.datagram);
+        let now = Instant::now();
+        pacer.spend(wire_bytes, now);
+        let mut traffic = self.traffic.lock();
+        traffic.add(
+            now,
+            &transmit.to.flow.layer,
+            transmit.class,
+            wire_bytes as u64,
+            transmit.control,
+        );
+        if outcome == SendOutcome::NotSent {
+            traffic.not_sent += 1;
+        }
+    }
+}
+
+impl Pause {
+    fn until(&self) -> Instant {
+        let (Self::Debt(until) | Self::Idle(until)) = *self;
+        until
     }
 }
 

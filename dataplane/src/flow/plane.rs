@@ -1,7 +1,8 @@
 //! The message path and the link of one flow behind one lock.
 //!
 //! Source tasks, the transport's reader threads and the pacer take the lock once per batch or
-//! datagram and never while they wait. What the link has to say to the control core is put into a
+//! datagram and never while they wait. Who has brought something then lets out what may leave, so
+//! that nobody else is woken for it. What the link has to say to the control core is put into a
 //! bounded inbox. A thread of the compression pool takes it twice for each of its jobs, to see what
 //! is to be done and to say what came of it, and not in between.
 
@@ -9,12 +10,13 @@ use std::collections::VecDeque;
 use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::thread::{self, Thread};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
 use blaze_domain::Scope;
 use blaze_proto::Frame;
-use parking_lot::{Condvar, Mutex};
+use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use crate::codec::pool::{CodecPool, Spawner, Urgency};
@@ -68,10 +70,13 @@ pub fn wall_ms() -> u64 {
 pub enum Next {
     /// A datagram to send.
     Datagram(Transmit),
-    /// Something waits, but the budget of its link does not let it out yet.
-    HeldBack,
-    /// Nothing is to be sent.
-    Nothing,
+    /// Nothing may be sent now.
+    Nothing {
+        /// When there is something to do again, as far as that is known.
+        due: Option<Instant>,
+        /// Something waits, but the budget of its link does not let it out yet.
+        is_held_back: bool,
+    },
 }
 
 /// Message path and link, without a lock: what the simulated network drives too.
@@ -172,6 +177,9 @@ impl PlaneState {
     }
 }
 
+/// Sends what may leave now. Returns whether somebody must look at the rest before long.
+pub type Outlet = Box<dyn Fn(&Plane) -> bool + Send + Sync>;
+
 /// What a thread does with a payload.
 type Run = fn(&Work, &[u8]) -> Done;
 
@@ -187,8 +195,9 @@ pub struct Plane {
     this: Weak<Self>,
     codec: OnceLock<Codec>,
     state: Mutex<PlaneState>,
-    /// The pacer waits here while it has nothing to send.
-    work: Condvar,
+    outlet: OnceLock<Outlet>,
+    /// The thread that sends what could not leave at once.
+    pacer: OnceLock<Thread>,
     news: Mutex<VecDeque<News>>,
     news_dropped: AtomicU64,
     news_waits: Notify,
@@ -204,7 +213,8 @@ impl Plane {
             this: Weak::clone(this),
             codec: OnceLock::new(),
             state: Mutex::new(PlaneState { core, engine }),
-            work: Condvar::new(),
+            outlet: OnceLock::new(),
+            pacer: OnceLock::new(),
             news: Mutex::default(),
             news_dropped: AtomicU64::new(0),
             news_waits: Notify::new(),
@@ -212,11 +222,31 @@ impl Plane {
         })
     }
 
-    /// Does something under the lock, carries out what the link then wants, and wakes the pacer.
+    /// Does something under the lock, carries out what the link then wants, and sends what may
+    /// leave.
     pub fn with<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> R {
         let (result, requests) = self.locked(action);
         self.hand_out(requests);
+        self.let_out();
         result
+    }
+
+    /// What is to be sent leaves by this from now on.
+    pub fn send_by(&self, outlet: Outlet) {
+        let _ = self.outlet.set(outlet);
+    }
+
+    /// The calling thread sends what cannot leave at once, and what is due later: it is unparked
+    /// for that.
+    pub fn pace_by_this_thread(&self) {
+        let _ = self.pacer.set(thread::current());
+    }
+
+    /// Sends what may leave now; the pacer sees to the rest.
+    fn let_out(&self) {
+        if self.outlet.get().is_some_and(|send| send(self)) {
+            self.wake();
+        }
     }
 
     /// The same for the link, where the flow has one.
@@ -239,7 +269,6 @@ impl Plane {
             told |= self.tell_calls(&state);
             (result, told, state.core.take_pool_requests())
         };
-        self.work.notify_one();
         if told {
             self.news_waits.notify_one();
         }
@@ -260,6 +289,7 @@ impl Plane {
             if let Some(plane) = plane.upgrade() {
                 let requests = plane.run_job(|state| state.begin(Instant::now(), urgency));
                 plane.hand_out(requests);
+                plane.let_out();
             }
         })?;
         if self.codec.set(Codec { pool, run }).is_ok() {
@@ -353,60 +383,58 @@ impl Plane {
         }
     }
 
-    /// The next datagram to send, or how long there is nothing to do (at most `idle`). Waits that
-    /// long.
-    pub fn next_transmit(&self, idle: Duration) -> Next {
-        self.transmit(idle, Engine::poll_transmit)
+    /// The next datagram to send.
+    pub fn next_transmit(&self) -> Next {
+        self.transmit(Engine::poll_transmit)
     }
 
-    /// The next datagram that carries no message; for a pacer in debt. Does not wait.
-    pub fn next_control(&self) -> Option<Transmit> {
-        match self.transmit(Duration::ZERO, Engine::poll_control) {
-            Next::Datagram(transmit) => Some(transmit),
-            Next::HeldBack | Next::Nothing => None,
-        }
+    /// The next datagram that carries no message; for a pacer in debt.
+    pub fn next_control(&self) -> Next {
+        self.transmit(Engine::poll_control)
     }
 
-    fn transmit(
-        &self,
-        idle: Duration,
-        next: impl Fn(&mut Engine, Instant) -> Option<Transmit>,
-    ) -> Next {
-        let mut told = false;
-        let (next, requests) = {
-            let mut state = self.state.lock();
-            let now = Instant::now();
-            let due = state.run_timers(now);
-            let mut tell = |event| {
-                told = true;
-                self.tell(event);
+    fn transmit(&self, next: impl Fn(&mut Engine, Instant) -> Option<Transmit>) -> Next {
+        loop {
+            let mut told = false;
+            let (next, requests) = {
+                let mut state = self.state.lock();
+                let now = Instant::now();
+                let due = state.run_timers(now);
+                let mut tell = |event| {
+                    told = true;
+                    self.tell(event);
+                };
+                state.pump(now, &mut tell);
+                let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
+                state.pump(now, &mut tell);
+                told |= self.tell_calls(&state);
+                let paced = state.engine.as_ref().and_then(Engine::paced_until);
+                let next = transmit.map_or_else(
+                    || Next::Nothing {
+                        due: due.into_iter().chain(paced).min(),
+                        is_held_back: paced.is_some(),
+                    },
+                    Next::Datagram,
+                );
+                (next, state.core.take_pool_requests())
             };
-            state.pump(now, &mut tell);
-            let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
-            state.pump(now, &mut tell);
-            told |= self.tell_calls(&state);
-            let paced = state.engine.as_ref().and_then(Engine::paced_until);
-            if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_pool_requests() {
-                let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
-                self.work.wait_until(&mut state, until);
+            if told {
+                self.news_waits.notify_one();
             }
-            let next = match transmit {
-                Some(transmit) => Next::Datagram(transmit),
-                None if paced.is_some() => Next::HeldBack,
-                None => Next::Nothing,
-            };
-            (next, state.core.take_pool_requests())
-        };
-        self.hand_out(requests);
-        if told {
-            self.news_waits.notify_one();
+            let is_over = requests == PoolRequests::default();
+            self.hand_out(requests);
+            // What the caller did for the pool may be sent, too.
+            if is_over || matches!(next, Next::Datagram(_)) {
+                return next;
+            }
         }
-        next
     }
 
     /// Wakes the pacer.
     pub fn wake(&self) {
-        self.work.notify_all();
+        if let Some(pacer) = self.pacer.get() {
+            pacer.unpark();
+        }
     }
 
     /// What the link has to say to the control core since the last call.

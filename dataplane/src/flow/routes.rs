@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Begin, Broker, BrokerError, Later, PublishOutcome, Publisher, PublisherOptions,
+    Begin, Broker, BrokerError, Later, PublishOutcome, Publisher, PublisherOptions, Received,
     SubscribeOptions,
 };
 use blaze_domain::names::ChannelName;
@@ -338,14 +338,14 @@ impl SourceTask {
                     }
                     *self.state.lock() = SourceState::Subscribed;
                     reported = false;
-                    let mut batch = Vec::with_capacity(BATCH);
-                    while subscription.receive(&mut batch, BATCH).await > 0 {
-                        let overrun = subscription.take_dropped();
+                    let (plane, topic, scope) = (Arc::clone(&self.plane), self.topic, self.scope);
+                    let sink = move |batch: &mut Vec<Received>, overrun| {
                         if overrun > 0 {
-                            self.plane.read(|state| state.core.count_overrun(self.topic, overrun));
+                            plane.read(|state| state.core.count_overrun(topic, overrun));
                         }
-                        self.plane.ingest(self.topic, self.scope, &mut batch);
-                    }
+                        plane.ingest(topic, scope, batch);
+                    };
+                    subscription.forward(BATCH, Box::new(sink)).await;
                     *self.state.lock() = SourceState::Starting;
                 }
                 Err(error) => {

@@ -136,9 +136,8 @@ impl Channel {
         let mut again = false;
         for (reader, kind) in by_kind.iter().zip(Kind::ALL) {
             let Some(reader) = reader else { continue };
-            again |= self.drain_one(shared, reader, kind, &mut progress, doubtful);
+            // Before it is emptied: what comes before a waker is set wakes nobody.
             reader.set_waker(Some(Waker::from(Arc::new(Bell(self.weak.clone())))));
-            // What came before the waker was set woke nobody.
             again |= self.drain_one(shared, reader, kind, &mut progress, doubtful);
         }
         let clock = |writer: EndpointId| {
@@ -148,19 +147,27 @@ impl Channel {
         let quiet = progress.history.quiet(Instant::now(), clock);
         drop(readers);
         self.send_kept(&quiet);
+        // Not under the lock: what takes the messages may publish, and this participant's messages
+        // go to its own readers.
+        let senders = self.senders.lock().clone();
+        senders.iter().for_each(SubscriptionSender::flush);
         if again {
             self.note_samples();
         }
     }
 
-    /// Hands a message to all who subscribed.
-    pub(super) fn send(&self, received: Received) {
+    /// Hands a message to all who subscribed, at the end of [`drain`](Self::drain).
+    pub(super) fn put(&self, received: Received) {
+        self.send_by(received, SubscriptionSender::put);
+    }
+
+    fn send_by(&self, received: Received, send: fn(&SubscriptionSender, Received) -> bool) {
         let mut senders = self.senders.lock();
         if let [sender] = &senders[..] {
             // Mostly there is one; one that has ended is swept later.
-            sender.send(received);
+            send(sender, received);
         } else {
-            senders.retain(|sender| sender.send(received.clone()));
+            senders.retain(|sender| send(sender, received.clone()));
         }
     }
 
@@ -404,7 +411,8 @@ impl Channels {
         let by_topic = self.by_topic.read();
         for channel in by_topic.get(topic).into_iter().flatten() {
             let Some(content) = content() else { return };
-            channel.send(Received::live(content, Instant::now()));
+            let received = Received::live(content, Instant::now());
+            channel.send_by(received, SubscriptionSender::send);
         }
     }
 

@@ -139,7 +139,7 @@ pub(super) fn deliver(
         Some(moment) if is_old => {
             received.kept = true;
             if let Some(received) = progress.history.hold(at, writer, received, moment) {
-                channel.send(received);
+                channel.put(received);
             }
         }
         _ => {
@@ -147,7 +147,7 @@ pub(super) fn deliver(
             let behind_ns =
                 moment.map(|moment| moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
             channel.send_kept(&progress.history.of_writer(writer, behind_ns));
-            channel.send(received);
+            channel.put(received);
         }
     }
 }

@@ -2,8 +2,9 @@
 //! RustDDS dies. What differs (names, types, what a sample holds) is a [`Dialect`].
 //!
 //! ```text
-//! publisher ─► outbox ─► sender thread ─► Slot (a DDS writer) ─► RustDDS ─► network
-//! network ─► RustDDS ─► reading threads (small, large) ─► Channel (one or two DDS readers) ─► readers' rings
+//! publisher ─► outbox ─► Sender ─► Slot (a DDS writer) ─► RustDDS ─► network
+//! network ─► RustDDS ─► reading threads (small, large) ─► Channel (one or two DDS readers) ─► readers' rings, sinks
+//! Sender: in the publisher's thread while little is written, else in one of its own
 //! lifecycle thread: participant, writers, readers; presence of others; builds all anew when RustDDS dies
 //! ```
 //!
@@ -378,5 +379,9 @@ impl TopicPublisher {
 impl OutboxAdmission for Arc<Shared> {
     fn is_shut(&self) -> bool {
         self.is_down()
+    }
+
+    fn takes_at_once(&self) -> bool {
+        send::write_at_once(self)
     }
 }

@@ -1,4 +1,5 @@
-//! The thread that hands messages to DDS writers.
+//! Hands messages to DDS writers: in the thread that publishes while little is written, else in a
+//! thread of its own.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -22,6 +23,8 @@ use crate::wake::wait;
 /// Messages and bytes of one turn; one message always fits.
 const TURN_MESSAGES: usize = 64;
 const TURN_BYTES: usize = 256 * 1024;
+/// Messages that a publisher writes itself.
+const AT_ONCE_MESSAGES: usize = 16;
 /// A full turn takes at least this long: RustDDS neither paces nor tells when it is behind, and
 /// what it sends at once must fit into the buffers of sockets and readers. So up to 32,000 messages
 /// and 128 MB per second.
@@ -139,33 +142,86 @@ pub(super) fn start(shared: &Arc<Shared>) -> Result<StoppableThread, DdsError> {
     let shared = Arc::clone(shared);
     let failed = Arc::<AtomicBool>::default();
     StoppableThread::start("dds-send", failed, move |stop| {
-        let mut sender =
-            Sender { shared, held: HashMap::new(), taken: Vec::with_capacity(TURN_MESSAGES) };
-        while !stop.load(Ordering::Relaxed) && !sender.shared.stop.load(Ordering::Acquire) {
-            sender.turn();
+        while !stop.load(Ordering::Relaxed) && !shared.stop.load(Ordering::Acquire) {
+            let rest = shared.sender.lock().turn(&shared, false);
+            match rest {
+                Rest::Pause(pause) => thread::sleep(pause),
+                // What is published meanwhile may go to another writer.
+                Rest::Filled(longest) => wait(shared.outbox.filled(), longest),
+                Rest::None => {}
+            }
         }
-        sender.held.clear();
-        sender.shared.held.store(0, Ordering::Release);
-        sender.shared.outbox.clear(DropReason::BrokerError);
+        shared.sender.lock().held.clear();
+        shared.held.store(0, Ordering::Release);
+        shared.outbox.clear(DropReason::BrokerError);
     })
 }
 
-struct Sender {
-    shared: Arc<Shared>,
+/// Writes what waits in this thread, if it is little and nobody else writes. Returns whether nothing
+/// is left to the sender's thread.
+pub(super) fn write_at_once(shared: &Shared) -> bool {
+    let Some(mut sender) = shared.sender.try_lock() else { return false };
+    if !sender.has_room(Instant::now()) {
+        return false;
+    }
+    sender.turn(shared, true);
+    sender.held.is_empty() && shared.outbox.is_empty()
+}
+
+/// What comes after a turn.
+enum Rest {
+    /// Nothing is written for so long.
+    Pause(Duration),
+    /// There is nothing to do until something is published, or for so long.
+    Filled(Duration),
+    /// The next turn.
+    None,
+}
+
+/// Whoever holds it writes, so that messages stay in order.
+pub(super) struct Sender {
     /// By target: what its writer could not take, in order.
     held: HashMap<u64, VecDeque<Waiting<Target>>>,
     taken: Vec<Waiting<Target>>,
+    /// Since when these were written.
+    since: Instant,
+    messages: usize,
+    bytes: usize,
 }
 
 impl Sender {
-    fn turn(&mut self) {
+    pub(super) fn new() -> Self {
+        let taken = Vec::with_capacity(TURN_MESSAGES);
+        Self { held: HashMap::new(), taken, since: Instant::now(), messages: 0, bytes: 0 }
+    }
+
+    /// Whether a publisher may write itself: nothing waits, and little was written lately.
+    fn has_room(&self, now: Instant) -> bool {
+        let is_over = |pause| now.saturating_duration_since(self.since) >= pause;
+        self.held.is_empty() && self.pause().is_none_or(is_over)
+    }
+
+    /// How long what was written takes at least, if it was much.
+    fn pause(&self) -> Option<Duration> {
+        let is_much = self.messages >= TURN_MESSAGES / 2 || self.bytes >= TURN_BYTES / 2;
+        let turns = u32::try_from(self.bytes.div_ceil(TURN_BYTES)).unwrap_or(u32::MAX).max(1);
+        is_much.then(|| TURN * turns)
+    }
+
+    /// Writes what it holds, and what waits, as far as that goes now; `at_once`: only a little.
+    fn turn(&mut self, shared: &Shared, at_once: bool) -> Rest {
         let begin = Instant::now();
-        let retried = self.retry(begin);
-        let bytes = self.shared.outbox.take_ready(
+        if begin.saturating_duration_since(self.since) >= self.pause().unwrap_or(TURN) {
+            (self.since, self.messages, self.bytes) = (begin, 0, 0);
+        }
+        let retried = self.retry(shared, begin);
+        let (messages, bytes) =
+            if at_once { (AT_ONCE_MESSAGES, LARGE_BYTES) } else { (TURN_MESSAGES, TURN_BYTES) };
+        let bytes = shared.outbox.take_ready(
             begin,
-            TURN_MESSAGES,
-            TURN_BYTES,
-            true,
+            messages,
+            bytes,
+            !at_once,
             |target| {
                 let is_free = !self.held.contains_key(&target.id) && target.may_write();
                 is_free.then_some(usize::MAX)
@@ -173,47 +229,41 @@ impl Sender {
             &mut self.taken,
         );
         // Until they are written they are nowhere else.
-        self.shared.held.fetch_add(self.taken.len(), Ordering::AcqRel);
+        shared.held.fetch_add(self.taken.len(), Ordering::AcqRel);
         let count = self.taken.len();
         let of_large = self.taken.iter().filter(|waiting| waiting.to.key.large).count();
-        let bytes = bytes.max(of_large * LARGE_COST);
-        for waiting in std::mem::take(&mut self.taken) {
-            self.write(waiting, begin);
+        let mut taken = std::mem::take(&mut self.taken);
+        for waiting in taken.drain(..) {
+            self.write(shared, waiting, begin);
         }
-        self.note_held();
-        if count + retried >= TURN_MESSAGES / 2 || bytes >= TURN_BYTES / 2 {
-            let turns = u32::try_from(bytes.div_ceil(TURN_BYTES)).unwrap_or(u32::MAX).max(1);
-            if let Some(rest) = (TURN * turns).checked_sub(begin.elapsed()) {
-                thread::sleep(rest);
+        self.taken = taken;
+        shared.held.store(self.held.values().map(VecDeque::len).sum(), Ordering::Release);
+        self.messages += count + retried;
+        self.bytes += bytes.max(of_large * LARGE_COST);
+        match self.pause() {
+            Some(pause) => {
+                let rest = pause.saturating_sub(self.since.elapsed());
+                if rest.is_zero() { Rest::None } else { Rest::Pause(rest) }
             }
-        } else if count == 0 {
-            self.rest();
+            None if count == 0 => Rest::Filled(self.longest_wait()),
+            None => Rest::None,
         }
     }
 
-    fn note_held(&self) {
-        let held = self.held.values().map(VecDeque::len).sum();
-        self.shared.held.store(held, Ordering::Release);
-    }
-
-    /// Waits for something to do.
-    fn rest(&self) {
+    /// How long it waits for something to do.
+    fn longest_wait(&self) -> Duration {
         if self.held.is_empty() {
-            wait(self.shared.outbox.filled(), IDLE);
-            return;
+            return IDLE;
         }
         let is_large = |queue: &VecDeque<Waiting<Target>>| {
             queue.front().is_some_and(|it| it.size() > LARGE_BYTES)
         };
-        let pause = if self.held.values().all(is_large) { LARGE_AGAIN } else { AGAIN };
-        // What is published meanwhile may go to another writer.
-        wait(self.shared.outbox.filled(), pause);
+        if self.held.values().all(is_large) { LARGE_AGAIN } else { AGAIN }
     }
 
     /// Writes what was held. Returns how many messages went.
-    fn retry(&mut self, now: Instant) -> usize {
+    fn retry(&mut self, shared: &Shared, now: Instant) -> usize {
         let mut gone = 0;
-        let shared = &self.shared;
         self.held.retain(|_, queue| {
             while let Some(waiting) = queue.pop_front() {
                 match attempt(shared, &waiting, now) {
@@ -232,13 +282,13 @@ impl Sender {
         gone
     }
 
-    fn write(&mut self, waiting: Waiting<Target>, now: Instant) {
+    fn write(&mut self, shared: &Shared, waiting: Waiting<Target>, now: Instant) {
         let id = waiting.to.id;
         if let Some(queue) = self.held.get_mut(&id) {
             queue.push_back(waiting);
             return;
         }
-        match attempt(&self.shared, &waiting, now) {
+        match attempt(shared, &waiting, now) {
             Some(fate) => waiting.settle(fate),
             None => self.held.entry(id).or_default().push_back(waiting),
         }
@@ -271,5 +321,25 @@ fn aged(waiting: &Waiting<Target>, now: Instant) -> Body {
     match &waiting.body {
         Body::Frame(frame) => Body::Frame(Waiting::<Target>::aged(frame, waiting.since, now)),
         Body::Bare(payload) => Body::Bare(payload.clone()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn publishers_write_themselves_while_it_is_little() {
+        let mut sender = Sender::new();
+        let now = sender.since;
+        assert!(sender.has_room(now));
+        sender.messages = TURN_MESSAGES / 2;
+        assert!(!sender.has_room(now) && sender.has_room(now + TURN));
+        (sender.messages, sender.bytes) = (1, 3 * TURN_BYTES);
+        assert!(!sender.has_room(now + 2 * TURN) && sender.has_room(now + 3 * TURN));
+        sender.bytes = TURN_BYTES / 2 - 1;
+        assert!(sender.has_room(now));
+        sender.held.insert(1, VecDeque::new());
+        assert!(!sender.has_room(now + TURN), "what waits goes first");
     }
 }

@@ -12,7 +12,7 @@ use parking_lot::{Mutex, RwLock};
 
 use super::channel::Channels;
 use super::presence::{Clock, Clocks};
-use super::send::Target;
+use super::send::{Sender, Target};
 use super::slot::Slots;
 use super::{DdsCounts, Dialect};
 use crate::dds::EndpointId;
@@ -52,6 +52,7 @@ pub(crate) struct Shared {
     pub(super) status: StatusCell,
     was_up: AtomicBool,
     pub(super) outbox: Arc<Outbox<Target>>,
+    pub(super) sender: Mutex<Sender>,
     /// Messages that the sender holds, because their writer cannot take them now.
     pub(super) held: AtomicUsize,
     pub(super) slots: Slots,
@@ -78,6 +79,7 @@ impl Shared {
             status: StatusCell::new(Health::Connecting, String::new()),
             was_up: AtomicBool::new(false),
             outbox: Outbox::new(LIMITS),
+            sender: Mutex::new(Sender::new()),
             held: AtomicUsize::new(0),
             slots: Slots::default(),
             channels: Channels::default(),

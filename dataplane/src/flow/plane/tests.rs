@@ -1,6 +1,7 @@
 //! The pool at work: threads between two message paths, over a link that carries every datagram.
 
 use std::sync::atomic::{AtomicBool, AtomicUsize};
+use std::time::Duration;
 
 use blaze_brokers::{Content, Later, PublishOutcome, Publisher, PublisherOptions};
 use blaze_domain::node_file::{Codec, Compression};
@@ -83,8 +84,7 @@ fn connect(plane: &Plane, from: Scope, to: Target, publisher: &Arc<Collector>) -
 
 /// Everything that one has to send to the other.
 fn carry(from: &Plane, to: &Plane) {
-    while let Next::Datagram(Transmit { class, datagram, .. }) = from.next_transmit(Duration::ZERO)
-    {
+    while let Next::Datagram(Transmit { class, datagram, .. }) = from.next_transmit() {
         to.transport_event(TransportEvent::Received { class, datagram });
     }
 }
@@ -248,4 +248,25 @@ fn the_threads_end_with_the_message_path() {
     robot.compress_with(3, spawner).unwrap();
     drop(robot);
     eventually(|| ended.load(Ordering::SeqCst) == 3);
+}
+
+#[test]
+fn what_is_brought_is_sent_by_who_brought_it() {
+    let mut pair = Pair::new(Work::run);
+    let sent = Arc::new(Mutex::new(Vec::new()));
+    let (cloud, sends) = (Arc::clone(&pair.cloud), Arc::clone(&sent));
+    pair.robot.send_by(Box::new(move |robot| {
+        // Not under the lock.
+        carry(robot, &cloud);
+        sends.lock().push(std::thread::current().id());
+        false
+    }));
+    let topic = pair.topic;
+    pair.robot.read(|state| state.core.path_mut(topic).compression.codec = Codec::None);
+    pair.publish(1);
+    assert_eq!(*sent.lock(), [std::thread::current().id()]);
+    eventually(|| {
+        pair.carry();
+        pair.arrived() == [1]
+    });
 }
