@@ -14,11 +14,12 @@ import node_tools
 import python_tools
 import ros
 import servers
-from common import DOWNLOADS, HOME, TEMPLATES, Failure, Pin, pins, run, say, sha256
+from common import DOWNLOADS, HOME, SCRIPTS, TEMPLATES, Failure, Pin, pins, run, say, sha256
 
 BIN = HOME / "bin"
 # A change of how things are unpacked makes old stamps void.
 LAYOUT = "2"
+FASTDDS_PEER = SCRIPTS.parent / "tests" / "peers" / "fastdds_peer.cpp"
 MAVEN_COPY = "org.apache.maven.plugins:maven-dependency-plugin:3.8.1:copy-dependencies"
 
 
@@ -148,6 +149,17 @@ def etcd() -> None:
     new.rename(BIN / "etcd")
     shutil.rmtree(root.parent)
     run(BIN / "etcd", "--version")
+
+
+def fastdds() -> None:
+    """A peer of tests on Debian's Fast DDS, whose libraries it finds where they are unpacked."""
+    root = HOME / "fastdds" / "root"
+    unpack_debian(pins("fastdds"), root)
+    libraries = next(root.glob("usr/lib/*/libfastrtps.so")).parent
+    new = BIN / "fastdds-peer.new"
+    run("g++", "-std=c++17", "-O1", "-Wall", "-Werror", "-isystem", root / "usr" / "include", FASTDDS_PEER, "-o", new,
+        f"-L{libraries}", "-lfastrtps", f"-Wl,--disable-new-dtags,-rpath,{libraries},-rpath-link,{libraries}")
+    new.rename(BIN / "fastdds-peer")
 
 
 def mongo() -> None:
@@ -380,6 +392,7 @@ COMPONENTS = {
     "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
     "valkey": Component(valkey, files=(BIN / "valkey-server",)),
     "etcd": Component(etcd, files=(BIN / "etcd",)),
+    "fastdds": Component(fastdds, files=(BIN / "fastdds-peer", HOME / "fastdds" / "root"), locks=(FASTDDS_PEER,)),
     "mongo": Component(mongo, files=(BIN / "mongod",)),
     "jre": Component(jre, files=(HOME / "jre" / "bin" / "java",)),
     "python": Component(python, files=(python_tools.FOLDER,), locks=(python_tools.LOCK,)),

@@ -1,5 +1,5 @@
-//! Nodes of ROS 2 for tests: rclpy of two releases with Fast DDS, and Cyclone DDS in the manner of
-//! rmw_cyclonedds, from the packages that `scripts/services install` gets.
+//! Nodes of ROS 2 for tests: rclpy of two releases with Fast DDS, Cyclone DDS in the manner of
+//! rmw_cyclonedds, and Fast DDS without ROS, from what `scripts/services install` gets.
 //!
 //! A [`Peer`] is a process with any number of nodes; its commands are those of
 //! `tests/peers/peer.py`.
@@ -38,15 +38,17 @@ pub enum Release {
     Kilted,
     /// Cyclone DDS, which knows no graph and no actions.
     Cyclone,
+    /// A C++ program on Fast DDS alone, which tells no node and knows no services.
+    FastDds,
 }
 
 impl Release {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Jazzy, Self::Kilted, Self::Cyclone];
+    pub const ALL: [Self; 4] = [Self::Jazzy, Self::Kilted, Self::Cyclone, Self::FastDds];
 
     fn packages(self) -> &'static str {
         match self {
-            Self::Jazzy | Self::Cyclone => "jazzy",
+            Self::Jazzy | Self::Cyclone | Self::FastDds => "jazzy",
             Self::Kilted => "kilted",
         }
     }
@@ -54,7 +56,7 @@ impl Release {
     /// Fast DDS 2 knows the old name alone.
     fn profile_variable(self) -> &'static str {
         match self {
-            Self::Jazzy | Self::Cyclone => "FASTRTPS_DEFAULT_PROFILES_FILE",
+            Self::Jazzy | Self::Cyclone | Self::FastDds => "FASTRTPS_DEFAULT_PROFILES_FILE",
             Self::Kilted => "FASTDDS_DEFAULT_PROFILES_FILE",
         }
     }
@@ -63,6 +65,7 @@ impl Release {
         match self {
             Self::Jazzy | Self::Kilted => "ros2_peer.py",
             Self::Cyclone => "cyclone_peer.py",
+            Self::FastDds => "fastdds_peer.py",
         }
     }
 }
@@ -206,6 +209,9 @@ impl Peer {
                      min='4MB'/></Internal>"
                 ),
             );
+        if release == Release::FastDds {
+            command.arg(installed::path("bin/fastdds-peer")?);
+        }
         let (dialogue, ready) = Dialogue::start(&format!("{release:?}"), command, START)?;
         anyhow::ensure!(ready["ready"].is_string(), "{release:?} says {ready}");
         Ok(Self { release, dialogue, next: AtomicU32::new(0), _profile: folder })

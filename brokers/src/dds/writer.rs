@@ -3,8 +3,9 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use parking_lot::Mutex;
 use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, RTPSEntity, StatusEvented, WriteOptionsBuilder, no_key};
 
@@ -32,7 +33,7 @@ pub enum Written {
     Taken(i64),
     /// Nobody reads the topic.
     NoReader,
-    /// The window is full: a reader has not acknowledged, or the socket takes nothing.
+    /// Not now: a reader has not acknowledged, or the socket takes nothing.
     Full,
     /// RustDDS refused, or has died.
     Failed,
@@ -46,11 +47,52 @@ const AT_ONCE_BYTES: usize = 2 * 1024 * 1024;
 /// the writer offers makes one.
 const STATUS_EVENTS: usize = 4;
 
+/// The vendor of Cyclone DDS, with which its identities begin.
+const CYCLONE: [u8; 2] = [0x01, 0x10];
+/// How long samples wait until readers have acknowledged those before.
+const LONGEST_BEGIN: Duration = Duration::from_millis(200);
+
+/// How far a writer is with readers of Cyclone DDS that it has just met. Such a reader, if volatile,
+/// begins behind the last sample that it is told of first. RustDDS answers no questions as long as
+/// it has no sample, and tells with the first datagram also of those that are still to come. So
+/// nothing is written until all before is acknowledged, and the first one goes alone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Begin {
+    /// All readers know where they begin.
+    Done,
+    /// There is a new reader.
+    New,
+    /// A sample waits since then.
+    Waits(Instant),
+}
+
+impl Begin {
+    /// Whether a sample may be written. `acknowledged`: all that is written; `wrote`: something is.
+    fn allows(&mut self, now: Instant, acknowledged: bool, wrote: bool) -> bool {
+        let may = match *self {
+            Self::Done => true,
+            Self::New => acknowledged,
+            Self::Waits(since) => {
+                acknowledged || now.saturating_duration_since(since) >= LONGEST_BEGIN
+            }
+        };
+        *self = match *self {
+            _ if may && wrote => Self::Done,
+            Self::New if !may => Self::Waits(now),
+            other => other,
+        };
+        may
+    }
+}
+
 /// Writes one topic. Never waits.
 pub struct Writer {
     writer: no_key::DataWriter<Cdr, CdrAdapter>,
     /// How many readers it has met.
     matched: AtomicUsize,
+    begin: Mutex<Begin>,
+    /// Whether it has written anything.
+    wrote: AtomicBool,
     /// Late joiners get what was written before they came, so it is written without a reader, too.
     keeps: bool,
     failed: Arc<AtomicBool>,
@@ -63,7 +105,9 @@ impl Writer {
         keeps: bool,
         failed: Arc<AtomicBool>,
     ) -> Self {
-        Self { writer, matched: AtomicUsize::new(0), keeps, failed }
+        let begin = Mutex::new(Begin::Done);
+        let (matched, wrote) = (AtomicUsize::new(0), AtomicBool::new(false));
+        Self { writer, matched, begin, wrote, keeps, failed }
     }
 
     /// Hands octets to RustDDS, as a sample of [`FRAME_TYPE`](super::FRAME_TYPE). Returns whether
@@ -81,11 +125,17 @@ impl Writer {
             if !(self.matched_now() > 0 || self.keeps) {
                 return Some(Written::NoReader);
             }
+            if !self.may_begin() {
+                return Some(Written::Full);
+            }
             // Best effort gives up a sample of which the socket cannot take the rest at once.
             let waits = cdr.payload().len() > AT_ONCE_BYTES;
             let options = options.best_effort_may_block(waits).build();
             match self.writer.write_with_options(cdr, options) {
-                Ok(sample) => Some(Written::Taken(sample.sequence_number.into())),
+                Ok(sample) => {
+                    self.wrote.store(true, Ordering::Relaxed);
+                    Some(Written::Taken(sample.sequence_number.into()))
+                }
                 Err(WriteError::WouldBlock { .. }) => Some(Written::Full),
                 Err(_) => Some(Written::Failed),
             }
@@ -117,19 +167,31 @@ impl Writer {
         self.contain(|| Some(self.matched_now() >= readers.min(STATUS_EVENTS))).unwrap_or(false)
     }
 
+    fn may_begin(&self) -> bool {
+        let mut begin = self.begin.lock();
+        *begin == Begin::Done || {
+            let wrote = self.wrote.load(Ordering::Relaxed);
+            begin.allows(Instant::now(), self.is_acknowledged(), wrote)
+        }
+    }
+
     fn matched_now(&self) -> usize {
         let mut events = 0;
         while let Some(status) = self.writer.try_recv_status() {
             events += 1;
-            if let DataWriterStatus::PublicationMatched { current, .. } = status {
+            if let DataWriterStatus::PublicationMatched { current, reader, .. } = status {
                 let count = usize::try_from(current.count()).unwrap_or(0);
                 self.matched.store(count, Ordering::Relaxed);
+                if current.count_change() > 0 && endpoint_of(reader).starts_with(&CYCLONE) {
+                    *self.begin.lock() = Begin::New;
+                }
             }
         }
         if events >= STATUS_EVENTS {
             // Others may have been lost. A sample without a reader costs nothing, a reader without
             // its samples does.
             self.matched.fetch_max(STATUS_EVENTS, Ordering::Relaxed);
+            *self.begin.lock() = Begin::New;
         }
         self.matched.load(Ordering::Relaxed)
     }
@@ -139,5 +201,25 @@ impl Writer {
             self.failed.store(true, Ordering::Relaxed);
             None
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_sample_to_a_new_reader_of_cyclone_goes_alone() {
+        let (now, mut begin) = (Instant::now(), Begin::New);
+        assert!(begin.allows(now, true, false), "the first one");
+        assert!(!begin.allows(now, false, true), "it is not acknowledged");
+        assert!(!begin.allows(now, false, true) && begin == Begin::Waits(now));
+        assert!(begin.allows(now, true, true) && begin == Begin::Done);
+        assert!(begin.allows(now, false, true), "from then on without a pause");
+        // A reader comes later, while others have not acknowledged all.
+        begin = Begin::New;
+        assert!(!begin.allows(now, false, true));
+        assert!(begin.allows(now + LONGEST_BEGIN, false, true), "not for ever");
+        assert_eq!(begin, Begin::Done);
     }
 }

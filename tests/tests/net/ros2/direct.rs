@@ -34,7 +34,7 @@ fn peers_of_all_releases_exchange_messages() -> anyhow::Result<()> {
             let subscriptions =
                 peers.iter().map(|to| to.subscription("peer", &topic, kind, quality));
             let subscriptions = subscriptions.collect::<anyhow::Result<Vec<_>>>()?;
-            publisher.wait_matched(3, MEET)?;
+            publisher.wait_matched(peers.len() as u64, MEET)?;
             for subscription in &subscriptions {
                 subscription.wait_matched(1, MEET)?;
             }

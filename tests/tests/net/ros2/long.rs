@@ -12,7 +12,7 @@ fn every_release_reaches_every_other() -> anyhow::Result<()> {
     let pair = Pair::start()?;
     for from in Release::ALL {
         for to in Release::ALL {
-            routes::carry(&pair, from, to)?;
+            routes::carry(&pair, from, to, &routes::TOPICS)?;
         }
     }
     Ok(())
@@ -46,11 +46,10 @@ fn ten_thousand_calls_of_sixteen_clients_for_each_pair_of_releases() -> anyhow::
         for client in &clients {
             client.wait_available(true, MEET)?;
         }
-        clients[0].call(&serde_json::json!({}), ARRIVE)?;
         let start = std::time::Instant::now();
         services::call_all(&pair, &[(&caller, clients)], 625, ARRIVE * 20)?;
         println!("10,000 calls from {from:?} to {to:?} in {:?}", start.elapsed());
-        assert_eq!(server.served()?, 10_001);
+        assert_eq!(server.served()?, 10_000);
         services::wait_answered(&pair)?;
         caller.finish()?;
         called.finish()?;
