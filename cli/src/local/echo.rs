@@ -97,10 +97,9 @@ impl Decoder {
         if self.printed.len() >= MAX_PRINTED_ONCE {
             self.printed.clear();
         }
-        let detail = &failure.detail;
         self.printed
             .insert((encoding.to_owned(), failure.code))
-            .then(|| format!("{encoding} is printed as it is: {detail}"))
+            .then(|| format!("{encoding} is printed as it is: {failure}"))
     }
 }
 

@@ -115,17 +115,17 @@ impl Check {
         match types.get(std::time::Instant::now(), name).await {
             Ok(found) => Ok(Self(Some(found))),
             Err(failure) if failure.code == WhyCode::TypeUnknown => {
-                eprintln!("blaze: the payload is not checked: {}", failure.detail);
+                eprintln!("blaze: the payload is not checked: {failure}");
                 Ok(Self(None))
             }
-            Err(failure) => Err(CliError::Invalid(failure.detail)),
+            Err(failure) => Err(CliError::Invalid(failure.to_string())),
         }
     }
 
     fn payload(&self, json: &[u8]) -> Result<(), CliError> {
         let Some(found) = &self.0 else { return Ok(()) };
-        let refused = |detail| CliError::Invalid(format!("no {}: {detail}", found.name));
-        found.convert(Encoding::Cdr, json).map(drop).map_err(|failure| refused(failure.detail))
+        let refused = |failure| CliError::Invalid(format!("no {}: {failure}", found.name));
+        found.convert(Encoding::Cdr, json).map(drop).map_err(refused)
     }
 }
 

@@ -67,9 +67,9 @@ impl KnownTypes {
             self.missing.clear();
         }
         self.missing.insert(name.to_owned(), now);
-        self.ask(name).await.map_err(|reason| {
-            ConvertFailure::new(missing.code, format!("{}; {reason}", missing.detail))
-        })?;
+        self.ask(name)
+            .await
+            .map_err(|reason| ConvertFailure::new(missing.code, format!("{missing}; {reason}")))?;
         self.missing.remove(name);
         self.types.get(now, wanted)
     }
