@@ -4,6 +4,7 @@ use std::net::Ipv4Addr;
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
+use blaze_domain::media::cdr_of;
 use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, ServiceName, WriterId};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
@@ -138,7 +139,7 @@ impl Dialect for Ros {
         let header = Header {
             related,
             to,
-            encoding: format!("application/cdr; type={type_name}"),
+            encoding: cdr_of(type_name),
             type_hash: writer.type_hash.clone().unwrap_or_default(),
             lifespan_ms: writer.lifespan_ms(),
             reliable: writer.reliable,

@@ -10,6 +10,7 @@ use std::collections::BTreeMap;
 use std::sync::Weak;
 use std::time::{Duration, Instant};
 
+use blaze_domain::media::Media;
 use blaze_domain::{TopicName, WriterId};
 use blaze_proto::Frame;
 use bytes::Bytes;
@@ -248,7 +249,9 @@ impl Publisher for Offer {
     /// Writes a message of ROS 2 in its own type; another one is dropped.
     fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
         let state = &mut *self.state.lock();
-        let Some(type_name) = type_of(frame.encoding()) else { return state.refuse() };
+        let Media::Cdr { type_name: Some(type_name) } = Media::of(frame.encoding()) else {
+            return state.refuse();
+        };
         if let Some(written) = state.by_type.get_mut(type_name) {
             return written.publish(frame, deadline);
         }
@@ -275,13 +278,6 @@ impl Publisher for Offer {
         current.for_each(|publisher| add(&mut sum, publisher.later()));
         sum
     }
-}
-
-/// The type in `application/cdr; type=sensor_msgs/msg/Imu`.
-pub(super) fn type_of(encoding: &str) -> Option<&str> {
-    let (kind, parameters) = encoding.split_once(';')?;
-    let type_name = parameters.trim().strip_prefix("type=")?;
-    (kind.trim() == "application/cdr").then_some(type_name.trim())
 }
 
 fn add(sum: &mut Later, one: Later) {
@@ -341,16 +337,5 @@ mod tests {
         assert_eq!(offered(0, durable.clone()), (true, 1, false));
         assert_eq!(offered(3, durable), (true, 3, false));
         assert_eq!(offered(0, RosEndpoint { manual: true, ..plain }), (false, 0, true));
-    }
-
-    #[test]
-    fn the_type_of_a_message_is_in_its_encoding() {
-        assert_eq!(type_of("application/cdr; type=a/msg/B"), Some("a/msg/B"));
-        assert_eq!(type_of("application/cdr;type= a/msg/B "), Some("a/msg/B"));
-        for other in
-            ["", "application/cdr", "application/json; type=a/msg/B", "application/cdr; x=1"]
-        {
-            assert_eq!(type_of(other), None, "{other}");
-        }
     }
 }

@@ -9,7 +9,7 @@ use std::time::Instant;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use blaze_domain::WhyCode;
-use blaze_flow::types::media::Media;
+use blaze_domain::media::Media;
 use blaze_flow::types::{ConvertFailure, Encoding};
 use blaze_sdk::{Message, Request, SubscribeOptions};
 use clap::Args;

@@ -25,8 +25,8 @@ use super::{ControlCore, Output};
 use crate::plan::network::{Servers, servers};
 use crate::plan::{Survey, Target};
 use crate::registry::{CallIn, CalledTopics};
-use crate::types::media::{CALL, CALL_FAULT, CALL_REPLY};
 use crate::world::FlowState;
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
 
 /// Calls of a flow that wait for their replies.
 const MAX_PENDING: usize = 256;

@@ -12,8 +12,8 @@ use tokio_util::sync::CancellationToken;
 use super::Shared;
 use super::plane::wall_ns;
 use crate::lane::calls::CallAnswer;
-use crate::types::media::{CALL_FAULT, CALL_REPLY, Media};
 use crate::types::{ConvertFailure, Encoding, MessageType, Types};
+use blaze_domain::media::{CALL_FAULT, CALL_REPLY, Media};
 
 /// Answers calls until the flow ends.
 pub(super) async fn answer_calls(shared: Arc<Shared>, stop: CancellationToken) {

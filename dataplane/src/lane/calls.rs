@@ -20,7 +20,7 @@ use lru::LruCache;
 use super::admit::Admitted;
 use super::core::{DataCore, LaneLink};
 use crate::types::ConvertFailure;
-use crate::types::media::{CALL, Media};
+use blaze_domain::media::{CALL, Media};
 
 /// Requests of this flow whose replies are waited for; more than the flow lets wait, since those
 /// whose time is over are not taken out.

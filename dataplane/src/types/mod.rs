@@ -13,7 +13,6 @@
 
 mod cache;
 mod convert;
-pub mod media;
 mod parts;
 mod seek;
 

@@ -6,7 +6,7 @@ use blaze_proto::link::link_control::{Advertise, RouteState};
 use blaze_proto::{Frame, Header};
 
 use super::*;
-use crate::types::media::{CALL, CALL_FAULT, CALL_REPLY};
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
 
 const ROBOT: &str = "edge/robot-1";
 

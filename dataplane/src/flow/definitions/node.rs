@@ -15,7 +15,7 @@ use super::super::plane::wall_ns;
 use super::super::ros2::{Ros2Scope, Seen};
 use super::agree;
 use crate::types::MessageType;
-use crate::types::media::cdr_of;
+use blaze_domain::media::cdr_of;
 
 const SERVICE: &str = "get_type_description";
 const REQUEST: &str = "type_description_interfaces/srv/GetTypeDescription_Request";

@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::lane::calls::CallAnswer;
-use crate::types::media::{CALL, CALL_FAULT, CALL_REPLY};
 use crate::types::{MessageType, TopicTypes, Wanted};
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
 
 const STRING: &str = "std_msgs/msg/String";
 const ME: &str = "edge/robot-1";
