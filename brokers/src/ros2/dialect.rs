@@ -22,7 +22,7 @@ use crate::dds::adapter::{
 use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
-    Relay, Sample, Terms, Writer, Written, endpoint_of, take_up_to,
+    Relay, Sample, TimingQos, Writer, Written, endpoint_of, take_up_to,
 };
 use crate::outbox::Body;
 use crate::port::Content;
@@ -73,12 +73,11 @@ impl Dialect for Ros {
         self.relay.set_participant(participant.prefix());
         self.knowledge.set_own(participant.prefix());
         self.services.lock().forget_readers();
-        let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,
             transient_local: true,
             window: 64,
-            terms,
+            timing: TimingQos::MARKED,
             ..Profile::best_effort(depth)
         };
         Ok(Box::new(Graph {

@@ -19,7 +19,7 @@ use parking_lot::Mutex;
 use super::Inner;
 use super::endpoint::RosEndpoint;
 use super::names::RosName;
-use crate::dds::Terms;
+use crate::dds::TimingQos;
 use crate::dds::adapter::{MAX_ORIGINS, TopicPublisher};
 use crate::port::{Later, PublishOutcome, Publisher, PublisherOptions};
 use crate::retained::{RetainedBounds, RetainedCache};
@@ -41,7 +41,7 @@ pub(super) struct Offered {
     pub(super) reliable: bool,
     /// Samples for late joiners; 0 = volatile.
     pub(super) depth: u32,
-    pub(super) terms: Terms,
+    pub(super) timing: TimingQos,
 }
 
 impl Offered {
@@ -51,14 +51,14 @@ impl Offered {
         readers: impl IntoIterator<Item = &'a RosEndpoint>,
     ) -> Self {
         let PublisherOptions { reliable, depth, .. } = published;
-        let mut offered = Self { reliable, depth, terms: super::marked() };
+        let mut offered = Self { reliable, depth, timing: TimingQos::MARKED };
         for reader in readers {
             offered.reliable |= reader.reliable;
             offered.depth = offered.depth.max(reader.durable.into());
             let strictest = |one: Option<_>, other| one.into_iter().chain(other).min();
-            offered.terms.deadline = strictest(offered.terms.deadline, reader.deadline);
-            offered.terms.lease = strictest(offered.terms.lease, reader.lease);
-            offered.terms.manual |= reader.manual;
+            offered.timing.deadline = strictest(offered.timing.deadline, reader.deadline);
+            offered.timing.lease = strictest(offered.timing.lease, reader.lease);
+            offered.timing.manual |= reader.manual;
         }
         offered.reliable |= offered.depth > 0;
         offered
@@ -311,9 +311,9 @@ mod tests {
     fn a_writer_offers_what_the_strictest_reader_asks_for() {
         let offered = |reliable, readers: &[RosEndpoint]| {
             let offered = Offered::to(published(reliable, 0), readers);
-            assert!(offered.terms.marked);
+            assert!(offered.timing.marked);
             let ms = |time: Option<Duration>| time.map(|time| time.as_millis());
-            (offered.reliable, ms(offered.terms.deadline), ms(offered.terms.lease))
+            (offered.reliable, ms(offered.timing.deadline), ms(offered.timing.lease))
         };
         let (loose, strict) = (reader(false, None, Some(500)), reader(true, Some(20), None));
         assert_eq!(offered(false, &[]), (false, None, None));
@@ -326,9 +326,9 @@ mod tests {
     #[test]
     fn readers_that_ask_for_more_than_is_published_are_served() {
         let offered = |depth, reader: RosEndpoint| {
-            let Offered { reliable, depth, terms } =
+            let Offered { reliable, depth, timing } =
                 Offered::to(published(false, depth), [&reader]);
-            (reliable, depth, terms.manual)
+            (reliable, depth, timing.manual)
         };
         let plain = reader(false, None, None);
         assert_eq!(offered(0, plain.clone()), (false, 0, false));

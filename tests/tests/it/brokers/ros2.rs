@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    Cdr, EndpointId, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer,
+    Cdr, EndpointId, Participant, ParticipantConfig, Profile, Reader, Sample, TimingQos, Writer,
     Written,
 };
 use blaze_brokers::ros2::{GidLength, Network, Ros2Broker, Ros2Config, Shown};
@@ -191,9 +191,9 @@ impl Reads {
     }
 }
 
-fn with_terms(profile: Profile, deadline_s: Option<u64>, manual: bool) -> Profile {
+fn with_timing(profile: Profile, deadline_s: Option<u64>, manual: bool) -> Profile {
     let deadline = deadline_s.map(Duration::from_secs);
-    Profile { terms: Terms { deadline, manual, ..Terms::default() }, ..profile }
+    Profile { timing: TimingQos { deadline, manual, ..TimingQos::default() }, ..profile }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -209,7 +209,7 @@ async fn each_message_comes_once_while_readers_with_other_demands_come_and_go() 
         // Twice others come, and go after a while.
         match number {
             20 | 130 => {
-                let profile = with_terms(reliable(256), Some(10), number == 130);
+                let profile = with_timing(reliable(256), Some(10), number == 130);
                 other = Some(Reads::start(&guest, "rt/a", profile));
             }
             90 | 200 => drop(other.take()),
@@ -242,7 +242,7 @@ async fn what_was_published_for_late_joiners_survives_other_writers() {
     let mut found = early.until(4).await;
     found.sort_unstable();
     assert!(found.ends_with(&[2, 3, 4]), "{found:?}");
-    let late = Reads::start(&guest, "rt/map", with_terms(keeping(16), Some(10), false));
+    let late = Reads::start(&guest, "rt/map", with_timing(keeping(16), Some(10), false));
     eventually("what was kept", || {
         let mut found = late.found.lock().clone();
         found.sort_unstable();
@@ -263,7 +263,7 @@ async fn a_reader_that_asks_for_more_than_is_published_is_served() {
         net.broker.publisher(&"a".parse().unwrap(), PublisherOptions::default()).unwrap();
     let readers = [
         Reads::start(&node, "rt/a", keeping(16)),
-        Reads::start(&guest, "rt/a", with_terms(Profile::best_effort(16), None, true)),
+        Reads::start(&guest, "rt/a", with_timing(Profile::best_effort(16), None, true)),
     ];
     net.network("the readers", |network| network.endpoints.len() == 2).await;
     let until = Instant::now() + DEADLINE;
