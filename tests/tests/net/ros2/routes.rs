@@ -4,7 +4,7 @@
 use anyhow::Context as _;
 use blaze_tests::ros2::{Quality, Release, Stream};
 
-use super::support::{ARRIVE, NODE, Pair, ends};
+use super::support::{ARRIVE, DEEP, NODE, Pair, ends};
 
 const STATIC: &str = "/tf_static";
 const TRANSFORMS: &str = "tf2_msgs/msg/TFMessage";
@@ -19,16 +19,6 @@ const TOPICS: [(&str, &str, usize, usize, f64); 7] = [
     ("/image", "sensor_msgs/msg/Image", 1_000_000, 5, 2.0),
     ("/large", "sensor_msgs/msg/Image", 6_000_000, 2, 0.5),
 ];
-
-/// Room for all messages at the listener, should it get no processor for a while.
-const DEEP: Quality = Quality {
-    reliable: true,
-    durable: false,
-    depth: 1_000,
-    deadline_ms: 0,
-    lease_ms: 0,
-    lifespan_ms: 0,
-};
 
 /// Every topic from one release to another.
 pub(super) fn carry(pair: &Pair, from: Release, to: Release) -> anyhow::Result<()> {
