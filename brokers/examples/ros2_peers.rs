@@ -20,7 +20,8 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::dds::{
-    Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer, Written,
+    Cdr, DdsError, Participant, ParticipantConfig, Profile, Reader, Sample, TimingQos, Writer,
+    Written,
 };
 use blaze_brokers::ros2::{GidLength, Ros2Broker, Ros2Config};
 use blaze_brokers::{Broker as _, Content, Health, Publisher, PublisherOptions, SubscribeOptions};
@@ -65,8 +66,7 @@ fn main() -> Result<(), Error> {
 }
 
 fn reliable(depth: u16) -> Profile {
-    let terms = Terms { marked: true, ..Terms::default() };
-    Profile { reliable: true, window: 64, terms, ..Profile::best_effort(depth) }
+    Profile { reliable: true, window: 64, timing: TimingQos::MARKED, ..Profile::best_effort(depth) }
 }
 
 /// A reader whose samples come out of a queue.

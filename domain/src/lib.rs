@@ -7,6 +7,7 @@
 pub mod config;
 pub mod control;
 pub mod identity;
+pub mod media;
 pub mod names;
 pub mod node_file;
 pub mod qos;

@@ -39,7 +39,7 @@ use blaze_domain::node_file::MAX_DDS_DOMAIN;
 
 #[cfg(feature = "fault-injection")]
 pub use fault::Fault;
-pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, Terms};
+pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, TimingQos};
 pub use pulse::{Illness, Pulse};
 pub(crate) use reader::take_up_to;
 pub use reader::{OctetsSink, Reader, Sample, SampleSink};

@@ -138,13 +138,13 @@ pub struct Profile {
     /// not by others; at least `depth`. RustDDS keeps them, and those of the last six seconds, in
     /// memory.
     pub window: u16,
-    /// Deadline, lease of liveliness, mark of flows.
-    pub terms: Terms,
+    /// Deadline, liveliness lease, mark of flows.
+    pub timing: TimingQos,
 }
 
-/// Deadline, lease of liveliness and mark of a writer or reader.
+/// Deadline and liveliness lease of a writer or reader, and the Lifespan that marks those of flows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub struct Terms {
+pub struct TimingQos {
     /// Whether it is marked as an endpoint of a flow, for other flows.
     pub marked: bool,
     /// A writer offers a sample at least this often; a reader asks for that.
@@ -155,11 +155,22 @@ pub struct Terms {
     pub manual: bool,
 }
 
+impl TimingQos {
+    /// An endpoint of a flow, without deadline and lease.
+    pub const MARKED: Self = Self { marked: true, deadline: None, lease: None, manual: false };
+}
+
 impl Profile {
     /// Best effort with room for `depth` samples.
     #[must_use]
     pub fn best_effort(depth: u16) -> Self {
-        Self { reliable: false, depth, transient_local: false, window: 0, terms: Terms::default() }
+        Self {
+            reliable: false,
+            depth,
+            transient_local: false,
+            window: 0,
+            timing: TimingQos::default(),
+        }
     }
 
     fn qos(self) -> QosPolicies {
@@ -175,16 +186,16 @@ impl Profile {
                 max_instances: 1,
                 max_samples_per_instance: samples,
             });
-        if let Some(deadline) = self.terms.deadline {
+        if let Some(deadline) = self.timing.deadline {
             builder = builder.deadline(Deadline(duration(deadline)));
         }
-        let lease_duration = self.terms.lease.map_or(Duration::INFINITE, duration);
-        if self.terms.manual {
+        let lease_duration = self.timing.lease.map_or(Duration::INFINITE, duration);
+        if self.timing.manual {
             builder = builder.liveliness(Liveliness::ManualByTopic { lease_duration });
-        } else if self.terms.lease.is_some() {
+        } else if self.timing.lease.is_some() {
             builder = builder.liveliness(Liveliness::Automatic { lease_duration });
         }
-        if self.terms.marked {
+        if self.timing.marked {
             builder = builder.lifespan(Lifespan { duration: mark() });
         }
         if self.reliable {

@@ -4,6 +4,7 @@ use std::net::Ipv4Addr;
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
+use blaze_domain::media::cdr_of;
 use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Origin, ServiceName, WriterId};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
@@ -21,7 +22,7 @@ use crate::dds::adapter::{
 use crate::dds::participant::{RawReader, prefix_of};
 use crate::dds::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Profile,
-    Relay, Sample, Terms, Writer, Written, endpoint_of, take_up_to,
+    Relay, Sample, TimingQos, Writer, Written, endpoint_of, take_up_to,
 };
 use crate::outbox::Body;
 use crate::port::Content;
@@ -72,12 +73,11 @@ impl Dialect for Ros {
         self.relay.set_participant(participant.prefix());
         self.knowledge.set_own(participant.prefix());
         self.services.lock().forget_readers();
-        let terms = Terms { marked: true, ..Terms::default() };
         let keep = |depth| Profile {
             reliable: true,
             transient_local: true,
             window: 64,
-            terms,
+            timing: TimingQos::MARKED,
             ..Profile::best_effort(depth)
         };
         Ok(Box::new(Graph {
@@ -138,7 +138,7 @@ impl Dialect for Ros {
         let header = Header {
             related,
             to,
-            encoding: format!("application/cdr; type={type_name}"),
+            encoding: cdr_of(type_name),
             type_hash: writer.type_hash.clone().unwrap_or_default(),
             lifespan_ms: writer.lifespan_ms(),
             reliable: writer.reliable,

@@ -33,7 +33,7 @@ use tokio::sync::watch;
 
 use crate::dds::adapter::{Adapter, Topic, TopicPublisher};
 use crate::dds::layer::DdsCounts;
-use crate::dds::{DdsError, EndpointId, Relay, RelayConfig, SLOTS, Terms};
+use crate::dds::{DdsError, EndpointId, Relay, RelayConfig, SLOTS, TimingQos};
 use crate::port::{
     Broker, BrokerError, BrokerKind, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions,
     Subscription, SubscriptionSender,
@@ -308,7 +308,7 @@ impl Inner {
         offered: Offered,
         large: bool,
     ) -> Option<TopicPublisher> {
-        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, offered.terms);
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, offered.timing);
         let Offered { depth, reliable, .. } = offered;
         self.adapter.publisher(topic, PublisherOptions { depth, reliable, large }).ok()
     }
@@ -324,7 +324,7 @@ impl Inner {
         if offered.depth == 0 {
             return self.writer(name, topic, type_name, offered, false);
         }
-        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, offered.terms);
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, offered.timing);
         Some(self.adapter.keeping(topic, offered.depth))
     }
 
@@ -335,7 +335,7 @@ impl Inner {
         topic: &TopicName,
         type_name: &str,
     ) -> Option<Subscription> {
-        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, marked());
+        let topic = dds_topic(name, topic, &type_to_dds(type_name)?, TimingQos::MARKED);
         let options = SubscribeOptions { max_messages: 1, ..SubscribeOptions::default() };
         let (sender, idle) = crate::port::subscription(options);
         self.adapter.read(topic, sender, options).ok()?;
@@ -389,7 +389,7 @@ impl Read {
                 || inner.knowledge.is_written(&self.name, dds_type)
         };
         for unused in self.types.extract_if(.., |dds_type| !is_used(dds_type)) {
-            let topic = dds_topic(&self.name, &self.topic, &unused, marked());
+            let topic = dds_topic(&self.name, &self.topic, &unused, TimingQos::MARKED);
             inner.adapter.stop_reading(&topic, &self.sender);
         }
         for writer in writers.iter().filter(|writer| writer.is_readable()) {
@@ -402,7 +402,7 @@ impl Read {
                 }
                 return;
             }
-            let topic = dds_topic(&self.name, &self.topic, &writer.dds_type, marked());
+            let topic = dds_topic(&self.name, &self.topic, &writer.dds_type, TimingQos::MARKED);
             match inner.adapter.read(topic, self.sender.clone(), self.options) {
                 Ok(()) => _ = self.types.insert(writer.dds_type.clone()),
                 Err(error) => tracing::warn!(topic = %self.topic, %error, "not read"),
@@ -411,15 +411,11 @@ impl Read {
     }
 }
 
-fn marked() -> Terms {
-    Terms { marked: true, ..Terms::default() }
-}
-
-fn dds_topic(name: &RosName, topic: &TopicName, dds_type: &str, terms: Terms) -> Topic {
+fn dds_topic(name: &RosName, topic: &TopicName, dds_type: &str, timing: TimingQos) -> Topic {
     Topic {
         name: name.to_dds().into(),
         user: topic.as_str().into(),
         type_name: dds_type.into(),
-        terms,
+        timing,
     }
 }

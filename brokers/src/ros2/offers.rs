@@ -10,6 +10,7 @@ use std::collections::BTreeMap;
 use std::sync::Weak;
 use std::time::{Duration, Instant};
 
+use blaze_domain::media::Media;
 use blaze_domain::{TopicName, WriterId};
 use blaze_proto::Frame;
 use bytes::Bytes;
@@ -18,7 +19,7 @@ use parking_lot::Mutex;
 use super::Inner;
 use super::endpoint::RosEndpoint;
 use super::names::RosName;
-use crate::dds::Terms;
+use crate::dds::TimingQos;
 use crate::dds::adapter::{MAX_ORIGINS, TopicPublisher};
 use crate::port::{Later, PublishOutcome, Publisher, PublisherOptions};
 use crate::retained::{RetainedBounds, RetainedCache};
@@ -40,7 +41,7 @@ pub(super) struct Offered {
     pub(super) reliable: bool,
     /// Samples for late joiners; 0 = volatile.
     pub(super) depth: u32,
-    pub(super) terms: Terms,
+    pub(super) timing: TimingQos,
 }
 
 impl Offered {
@@ -50,14 +51,14 @@ impl Offered {
         readers: impl IntoIterator<Item = &'a RosEndpoint>,
     ) -> Self {
         let PublisherOptions { reliable, depth, .. } = published;
-        let mut offered = Self { reliable, depth, terms: super::marked() };
+        let mut offered = Self { reliable, depth, timing: TimingQos::MARKED };
         for reader in readers {
             offered.reliable |= reader.reliable;
             offered.depth = offered.depth.max(reader.durable.into());
             let strictest = |one: Option<_>, other| one.into_iter().chain(other).min();
-            offered.terms.deadline = strictest(offered.terms.deadline, reader.deadline);
-            offered.terms.lease = strictest(offered.terms.lease, reader.lease);
-            offered.terms.manual |= reader.manual;
+            offered.timing.deadline = strictest(offered.timing.deadline, reader.deadline);
+            offered.timing.lease = strictest(offered.timing.lease, reader.lease);
+            offered.timing.manual |= reader.manual;
         }
         offered.reliable |= offered.depth > 0;
         offered
@@ -248,7 +249,9 @@ impl Publisher for Offer {
     /// Writes a message of ROS 2 in its own type; another one is dropped.
     fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
         let state = &mut *self.state.lock();
-        let Some(type_name) = type_of(frame.encoding()) else { return state.refuse() };
+        let Media::Cdr { type_name: Some(type_name) } = Media::of(frame.encoding()) else {
+            return state.refuse();
+        };
         if let Some(written) = state.by_type.get_mut(type_name) {
             return written.publish(frame, deadline);
         }
@@ -275,13 +278,6 @@ impl Publisher for Offer {
         current.for_each(|publisher| add(&mut sum, publisher.later()));
         sum
     }
-}
-
-/// The type in `application/cdr; type=sensor_msgs/msg/Imu`.
-pub(super) fn type_of(encoding: &str) -> Option<&str> {
-    let (kind, parameters) = encoding.split_once(';')?;
-    let type_name = parameters.trim().strip_prefix("type=")?;
-    (kind.trim() == "application/cdr").then_some(type_name.trim())
 }
 
 fn add(sum: &mut Later, one: Later) {
@@ -315,9 +311,9 @@ mod tests {
     fn a_writer_offers_what_the_strictest_reader_asks_for() {
         let offered = |reliable, readers: &[RosEndpoint]| {
             let offered = Offered::to(published(reliable, 0), readers);
-            assert!(offered.terms.marked);
+            assert!(offered.timing.marked);
             let ms = |time: Option<Duration>| time.map(|time| time.as_millis());
-            (offered.reliable, ms(offered.terms.deadline), ms(offered.terms.lease))
+            (offered.reliable, ms(offered.timing.deadline), ms(offered.timing.lease))
         };
         let (loose, strict) = (reader(false, None, Some(500)), reader(true, Some(20), None));
         assert_eq!(offered(false, &[]), (false, None, None));
@@ -330,9 +326,9 @@ mod tests {
     #[test]
     fn readers_that_ask_for_more_than_is_published_are_served() {
         let offered = |depth, reader: RosEndpoint| {
-            let Offered { reliable, depth, terms } =
+            let Offered { reliable, depth, timing } =
                 Offered::to(published(false, depth), [&reader]);
-            (reliable, depth, terms.manual)
+            (reliable, depth, timing.manual)
         };
         let plain = reader(false, None, None);
         assert_eq!(offered(0, plain.clone()), (false, 0, false));
@@ -341,16 +337,5 @@ mod tests {
         assert_eq!(offered(0, durable.clone()), (true, 1, false));
         assert_eq!(offered(3, durable), (true, 3, false));
         assert_eq!(offered(0, RosEndpoint { manual: true, ..plain }), (false, 0, true));
-    }
-
-    #[test]
-    fn the_type_of_a_message_is_in_its_encoding() {
-        assert_eq!(type_of("application/cdr; type=a/msg/B"), Some("a/msg/B"));
-        assert_eq!(type_of("application/cdr;type= a/msg/B "), Some("a/msg/B"));
-        for other in
-            ["", "application/cdr", "application/json; type=a/msg/B", "application/cdr; x=1"]
-        {
-            assert_eq!(type_of(other), None, "{other}");
-        }
     }
 }

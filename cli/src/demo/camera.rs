@@ -6,8 +6,8 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use blaze_domain::media::cdr_of;
 use blaze_domain::{MAX_PAYLOAD_BYTES, TopicName};
-use blaze_flow::types::media::cdr_of;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use zune_jpeg::JpegDecoder;

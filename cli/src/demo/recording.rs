@@ -11,6 +11,7 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use blaze_domain::media::cdr_of;
 use blaze_domain::{Durability, MAX_PAYLOAD_BYTES, NameError, TopicName};
 use bytes::Bytes;
 use mcap::McapError;
@@ -387,7 +388,7 @@ impl RawRecording {
                 None => {
                     let encoding = match type_name {
                         "" => "application/cdr".to_owned(),
-                        type_name => format!("application/cdr; type={type_name}"),
+                        type_name => cdr_of(type_name),
                     };
                     self.topics.push(RawTopic {
                         name,

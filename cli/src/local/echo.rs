@@ -9,7 +9,7 @@ use std::time::Instant;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use blaze_domain::WhyCode;
-use blaze_flow::types::media::Media;
+use blaze_domain::media::Media;
 use blaze_flow::types::{ConvertFailure, Encoding};
 use blaze_sdk::{Message, Request, SubscribeOptions};
 use clap::Args;
@@ -97,10 +97,9 @@ impl Decoder {
         if self.printed.len() >= MAX_PRINTED_ONCE {
             self.printed.clear();
         }
-        let detail = &failure.detail;
         self.printed
             .insert((encoding.to_owned(), failure.code))
-            .then(|| format!("{encoding} is printed as it is: {detail}"))
+            .then(|| format!("{encoding} is printed as it is: {failure}"))
     }
 }
 

@@ -61,7 +61,7 @@ fn parse_rate(text: &str) -> Result<f64, String> {
     }
 }
 
-fn parse_type(text: &str) -> Result<String, String> {
+pub(super) fn parse_type(text: &str) -> Result<String, String> {
     let is_name = |part: &&str| {
         part.starts_with(|first: char| first.is_ascii_alphabetic())
             && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
@@ -111,21 +111,21 @@ struct Check(Option<Arc<CompiledType>>);
 
 impl Check {
     /// Payloads of a type. One without a definition here is not checked, and that is printed.
-    async fn of(mut types: KnownTypes, name: &str) -> Result<Self, CliError> {
+    async fn of(types: KnownTypes, name: &str) -> Result<Self, CliError> {
         match types.get(std::time::Instant::now(), name).await {
             Ok(found) => Ok(Self(Some(found))),
             Err(failure) if failure.code == WhyCode::TypeUnknown => {
-                eprintln!("blaze: the payload is not checked: {}", failure.detail);
+                eprintln!("blaze: the payload is not checked: {failure}");
                 Ok(Self(None))
             }
-            Err(failure) => Err(CliError::Invalid(failure.detail)),
+            Err(failure) => Err(CliError::Invalid(failure.to_string())),
         }
     }
 
     fn payload(&self, json: &[u8]) -> Result<(), CliError> {
         let Some(found) = &self.0 else { return Ok(()) };
-        let refused = |detail| CliError::Invalid(format!("no {}: {detail}", found.name));
-        found.convert(Encoding::Cdr, json).map(drop).map_err(|failure| refused(failure.detail))
+        let refused = |failure| CliError::Invalid(format!("no {}: {failure}", found.name));
+        found.convert(Encoding::Cdr, json).map(drop).map_err(refused)
     }
 }
 

@@ -1,8 +1,6 @@
 //! ROS 2 types for `echo` and `pub`: built in, in the folders of the node file, else asked of the
 //! flow.
 
-use std::collections::HashMap;
-use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -13,23 +11,18 @@ use blaze_flow::types::{CompiledType, ConvertFailure, MessageType, Types, built_
 use serde_json::Value;
 use tokio::time::timeout;
 
+use super::publish::parse_type;
 use crate::args::FlowAddress;
 use crate::http::get_json;
 
 /// How long a flow may take to send a definition: messages wait for it.
 const ANSWER_WITHIN: Duration = Duration::from_secs(3);
-/// How long a flow is not asked again for a type that it did not have.
-const ASK_AGAIN: Duration = Duration::from_secs(5);
-/// Types without a definition that are remembered; a publisher may name any number.
-const MAX_MISSING: usize = 1_024;
 
 /// Types as a command knows them.
 pub(super) struct KnownTypes {
     types: Types,
     /// Admin port of the flow, if the node file names one.
     flow: Option<FlowAddress>,
-    /// Types that have no definition: when the flow was asked last.
-    missing: HashMap<String, Instant>,
 }
 
 impl KnownTypes {
@@ -38,39 +31,34 @@ impl KnownTypes {
         let ros2 = file.brokers.ros2.as_ref();
         let distro = ros2.map_or(Distro::Jazzy, |plugin| built_in_for(plugin.distro));
         let folders = ros2.map(|plugin| plugin.live.interfaces.clone());
+        let admin = file.admin.flow;
         Self {
             types: Types::new(distro, folders.unwrap_or_default()),
-            flow: admin_port(file),
-            missing: HashMap::new(),
+            flow: (admin.port() != 0).then(|| FlowAddress::from(admin)),
         }
     }
 
-    /// A type by its name, `sensor_msgs/msg/Imu`.
+    /// A type by its name, `sensor_msgs/msg/Imu`. The flow is asked for one that is not found here,
+    /// whenever it is sought anew.
     ///
     /// # Errors
     /// If nobody has its definition, or it cannot be converted.
     pub(super) async fn get(
-        &mut self,
+        &self,
         now: Instant,
         name: &str,
     ) -> Result<Arc<CompiledType>, ConvertFailure> {
         let wanted = MessageType { name, hash: "" };
+        if let Some(found) = self.types.known(now, wanted) {
+            return found;
+        }
         let missing = match self.types.get(now, wanted) {
             Err(failure) if failure.code == WhyCode::TypeUnknown => failure,
             found => return found,
         };
-        let asked = self.missing.get(name);
-        if asked.is_some_and(|asked| now.saturating_duration_since(*asked) < ASK_AGAIN) {
-            return Err(missing);
-        }
-        if self.missing.len() >= MAX_MISSING {
-            self.missing.clear();
-        }
-        self.missing.insert(name.to_owned(), now);
-        self.ask(name).await.map_err(|reason| {
-            ConvertFailure::new(missing.code, format!("{}; {reason}", missing.detail))
-        })?;
-        self.missing.remove(name);
+        self.ask(name)
+            .await
+            .map_err(|reason| ConvertFailure::new(missing.code, format!("{missing}; {reason}")))?;
         self.types.get(now, wanted)
     }
 
@@ -79,12 +67,8 @@ impl KnownTypes {
         let flow = self.flow.as_ref();
         let flow = flow.ok_or("the node file names no admin port of a flow that could have it")?;
         // Publishers may give any text.
-        if !name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"/_".contains(&byte)) {
-            return Err("it is no name of a type".to_owned());
-        }
-        let path = format!("/v1/ros2/types?type={name}");
-        let answer = get_json(flow, &path);
-        let answer = timeout(ANSWER_WITHIN, answer).await;
+        let path = format!("/v1/ros2/types?type={}", parse_type(name)?);
+        let answer = timeout(ANSWER_WITHIN, get_json(flow, &path)).await;
         let answer = answer.map_err(|_| format!("no answer of the flow at {flow}"))?;
         let answer = answer.map_err(|error| error.to_string())?;
         let text = answer.get("definition").and_then(Value::as_str);
@@ -93,15 +77,6 @@ impl KnownTypes {
         let description = parse_joined(name, text, None).map_err(|error| fault(&error))?;
         self.types.add(Source::Flow, description).map_err(|error| fault(&error))
     }
-}
-
-/// Where the flow of a node file is asked, from its own host.
-fn admin_port(file: &NodeFile) -> Option<FlowAddress> {
-    let mut address = file.admin.flow;
-    if address.ip().is_unspecified() {
-        address.set_ip(IpAddr::V4(Ipv4Addr::LOCALHOST));
-    }
-    (address.port() != 0).then(|| FlowAddress::from(address))
 }
 
 #[cfg(test)]
@@ -117,14 +92,10 @@ mod tests {
 
     const CUSTOM: &str = "my_robot/msg/Wheel";
 
-    fn file(tree: &Value) -> NodeFile {
-        NodeFile::read(tree).unwrap().0
-    }
-
-    /// A flow that has one definition; counts how often it is asked.
+    /// A flow that has one definition, and listens on all addresses; counts how often it is asked.
     fn flow(count: &Arc<AtomicUsize>) -> KnownTypes {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let address = listener.local_addr().unwrap();
+        let address = format!("0.0.0.0:{}", listener.local_addr().unwrap().port());
         let count = Arc::clone(count);
         std::thread::spawn(move || {
             for mut stream in listener.incoming().map_while(Result::ok) {
@@ -146,13 +117,13 @@ mod tests {
                     .unwrap();
             }
         });
-        KnownTypes::of(&file(&json!({"admin": {"flow": address.to_string()}})))
+        KnownTypes::of(&NodeFile::read(&json!({"admin": {"flow": address}})).unwrap().0)
     }
 
     #[tokio::test]
     async fn the_flow_is_asked_for_a_type_that_is_not_built_in() {
         let count = Arc::default();
-        let mut types = flow(&count);
+        let types = flow(&count);
         let now = Instant::now();
         types.get(now, "std_msgs/msg/String").await.unwrap();
         assert_eq!(count.load(Ordering::SeqCst), 0, "built in");
@@ -167,7 +138,7 @@ mod tests {
     #[tokio::test]
     async fn a_type_that_nobody_has_is_asked_for_every_five_seconds() {
         let count = Arc::default();
-        let mut types = flow(&count);
+        let types = flow(&count);
         let now = Instant::now();
         for (after, asked) in [(0, 1), (4, 1), (5, 2)] {
             let now = now + Duration::from_secs(after);
@@ -176,19 +147,7 @@ mod tests {
             assert_eq!(count.load(Ordering::SeqCst), asked, "after {after} s");
         }
         let failure = types.get(now, "my_robot/msg/No one?x").await.unwrap_err();
-        assert!(failure.detail.contains("no name of a type"), "{failure:?}");
+        assert!(failure.detail.contains("PKG/msg/NAME"), "{failure:?}");
         assert_eq!(count.load(Ordering::SeqCst), 2, "not asked for that");
-    }
-
-    #[test]
-    fn a_flow_is_asked_on_its_own_host() {
-        for (given, asked) in [
-            ("0.0.0.0:9101", Some("127.0.0.1:9101")),
-            ("10.0.0.1:7", Some("10.0.0.1:7")),
-            ("127.0.0.1:0", None),
-        ] {
-            let port = admin_port(&file(&json!({"admin": {"flow": given}})));
-            assert_eq!(port.map(|port| port.to_string()).as_deref(), asked);
-        }
     }
 }

@@ -27,7 +27,7 @@ pub mod upkeep;
 use std::sync::Arc;
 
 use blaze_domain::node_file::StoreSection;
-use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use blaze_runtime::supervisor::Supervisor;
 use tokio::sync::mpsc;
 
 #[cfg(feature = "mongodb")]
@@ -74,6 +74,8 @@ pub async fn open_with(
         }
         #[cfg(feature = "mongodb")]
         StoreSection::MongoDb(section) => {
+            use blaze_runtime::supervisor::TaskPolicy;
+
             let store = Arc::new(MongoStore::open_with(section, migrations).await?);
             if section.password_file.is_some() {
                 let (store, stop) = (Arc::clone(&store), supervisor.shutdown_token());

@@ -9,6 +9,7 @@
 //! order. A request is sent once, whatever becomes of it.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::num::NonZeroUsize;
 use std::time::{Duration, Instant};
 
 use blaze_domain::control::{
@@ -18,6 +19,7 @@ use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, Origin, Scope, ServiceName, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
+use lru::LruCache;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
@@ -25,13 +27,13 @@ use super::{ControlCore, Output};
 use crate::plan::network::{Servers, servers};
 use crate::plan::{Survey, Target};
 use crate::registry::{CallIn, CalledTopics};
-use crate::types::media::{CALL, CALL_FAULT, CALL_REPLY};
 use crate::world::FlowState;
+use blaze_domain::media::{CALL, CALL_FAULT};
 
 /// Calls of a flow that wait for their replies.
 const MAX_PENDING: usize = 256;
-/// Services, and callers of one, that are remembered: of services without a call the one that was
-/// used least recently gives way.
+/// Services, and callers of one, that are remembered: the one that was used least recently gives
+/// way, of services one without a call.
 const MAX_SERVICES: usize = 256;
 /// How long news of a server are waited for, by a flow that is ready.
 const SERVER_WITHIN: Duration = Duration::from_secs(1);
@@ -67,12 +69,22 @@ struct Pending {
 /// A service that is called through this flow.
 struct Service {
     topics: CalledTopics,
-    callers: BTreeSet<ServiceName>,
+    /// The name of each caller, and the flow of its server.
+    callers: LruCache<WriterId, (ServiceName, FlowId)>,
     used: Instant,
-    /// The flow of the server that each caller has.
-    chosen: BTreeMap<WriterId, FlowId>,
     /// Since when both topics are bridged here.
     planned: Option<Instant>,
+}
+
+impl Service {
+    fn new(topics: CalledTopics, used: Instant) -> Self {
+        let room = NonZeroUsize::new(MAX_SERVICES).unwrap_or(NonZeroUsize::MIN);
+        Self { topics, callers: LruCache::new(room), used, planned: None }
+    }
+
+    fn names(&self) -> BTreeSet<ServiceName> {
+        self.callers.iter().map(|(_, (name, _))| name.clone()).collect()
+    }
 }
 
 impl ControlCore {
@@ -125,24 +137,31 @@ impl ControlCore {
             }
             sought.entry(pending.call.common.topic.clone()).or_default().push(*number);
         }
-        for (service, numbers) in sought {
-            self.seek_server(now, &service, &numbers);
+        if sought.is_empty() {
+            return;
+        }
+        let survey = Survey::of(self.registry.world(), sought.len());
+        let found = sought.into_iter().filter_map(|(service, numbers)| {
+            let topics = CalledTopics::of(&service, "").ok()?;
+            let servers = servers(&survey, &topics.request);
+            Some((service, topics, numbers, servers))
+        });
+        for (service, topics, numbers, servers) in found.collect::<Vec<_>>() {
+            if servers.is_empty() {
+                self.end_unserved(now, &numbers);
+            } else {
+                self.use_service(now, &service, topics, &numbers, &servers);
+            }
         }
     }
 
-    fn seek_server(&mut self, now: Instant, service: &TopicName, numbers: &[u64]) {
-        let Ok(topics) = CalledTopics::of(service, "") else { return };
-        let servers = servers(&Survey::new(self.registry.world()), &topics.request);
-        if servers.is_empty() {
-            for number in numbers {
-                let began = self.calls.pending.get(number).map(|pending| pending.began);
-                if began.is_some_and(|began| now >= began + SERVER_WITHIN) {
-                    self.end_call(*number, |pending| Err(no_server(pending)));
-                }
+    fn end_unserved(&mut self, now: Instant, numbers: &[u64]) {
+        for number in numbers {
+            let began = self.calls.pending.get(number).map(|pending| pending.began);
+            if began.is_some_and(|began| now >= began + SERVER_WITHIN) {
+                self.end_call(*number, |pending| Err(no_server(pending)));
             }
-            return;
         }
-        self.use_service(now, service, topics, numbers, &servers);
     }
 
     /// Keeps the bridges of a service, with these calls' clients among its callers.
@@ -158,31 +177,20 @@ impl ControlCore {
             self.make_room(now);
         }
         let calls = &mut self.calls;
-        let service = calls.services.entry(name.clone()).or_insert_with(|| Service {
-            topics,
-            callers: BTreeSet::new(),
-            used: now,
-            chosen: BTreeMap::new(),
-            planned: None,
-        });
+        let service =
+            calls.services.entry(name.clone()).or_insert_with(|| Service::new(topics, now));
         service.used = now;
-        let before = service.callers.clone();
-        for pending in numbers.iter().filter_map(|number| calls.pending.get(number)) {
-            if service.callers.len() >= MAX_SERVICES {
-                service.callers.clear();
-            }
-            service.callers.insert(pending.call.common.service.clone());
-            let writer = pending.writer;
-            if let Some(flow) = servers.choose(writer, service.chosen.get(&writer)) {
-                if service.chosen.len() >= MAX_SERVICES {
-                    service.chosen.clear();
-                }
-                service.chosen.insert(writer, flow.clone());
+        let before = service.names();
+        for Pending { call, writer, .. } in numbers.iter().filter_map(|at| calls.pending.get(at)) {
+            let chosen = service.callers.get(writer).map(|(_, flow)| flow);
+            if let Some(flow) = servers.choose(*writer, chosen).cloned() {
+                service.callers.put(*writer, (call.common.service.clone(), flow));
             }
         }
-        if service.callers != before {
-            let (topics, callers) = (service.topics.clone(), service.callers.clone());
-            self.announce_callers(now, &topics, &callers);
+        let names = service.names();
+        if names != before {
+            let topics = service.topics.clone();
+            self.announce_callers(now, &topics, &names);
         }
     }
 
@@ -261,7 +269,7 @@ impl ControlCore {
     ) -> Option<FlowId> {
         let pending = self.calls.pending.get(&number)?;
         let service = self.calls.services.get_mut(&pending.call.common.topic)?;
-        let flow = service.chosen.get(&pending.writer)?;
+        let (_, flow) = service.callers.peek(&pending.writer)?;
         let CalledTopics { request, reply } = &service.topics;
         let plans = &self.plans;
         let has = |topic: &TopicName, is_such: fn(&crate::plan::Bridge) -> bool| {
@@ -374,17 +382,16 @@ fn read_reply(pending: &Pending, reply: &Frame) -> Result<Value, ControlError> {
         let pointer = format!("{}/topic", pending.pointer);
         ControlError::new(ErrorCode::ConvertError, pointer, detail)
     };
-    match reply.encoding() {
-        CALL_REPLY => serde_json::from_slice(reply.payload())
-            .map_err(|error| fault(format!("the reply is no JSON: {error}"))),
-        CALL_FAULT => Err(match serde_json::from_slice::<ControlError>(reply.payload()) {
-            Ok(error) => {
-                ControlError { pointer: format!("{}{}", pending.pointer, error.pointer), ..error }
-            }
-            Err(error) => fault(format!("the fault is no JSON: {error}")),
-        }),
-        other => Err(fault(format!("the flow of the server replies {other}, not JSON"))),
+    if reply.encoding() != CALL_FAULT {
+        return serde_json::from_slice(reply.payload())
+            .map_err(|error| fault(format!("the reply is no JSON: {error}")));
     }
+    Err(match serde_json::from_slice::<ControlError>(reply.payload()) {
+        Ok(error) => {
+            ControlError { pointer: format!("{}{}", pending.pointer, error.pointer), ..error }
+        }
+        Err(error) => fault(format!("the fault is no JSON: {error}")),
+    })
 }
 
 fn timeout(pending: &Pending) -> ControlError {

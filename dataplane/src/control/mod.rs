@@ -292,13 +292,12 @@ impl ControlCore {
     }
 
     /// A message could not be converted.
-    pub fn convert_failed(&mut self, wall_ms: u64, topic: TopicName, failure: ConvertFailure) {
-        let ConvertFailure { code, detail } = failure;
+    pub fn convert_failed(&mut self, wall_ms: u64, topic: TopicName, failure: &ConvertFailure) {
         let draft = EventDraft {
             event: EventKind::ConvertFailed,
             topic: Some(topic),
-            code: code.as_str(),
-            detail,
+            code: failure.code.as_str(),
+            detail: failure.to_string(),
         };
         self.tell(&draft, wall_ms);
     }

@@ -12,8 +12,8 @@ use tokio_util::sync::CancellationToken;
 use super::Shared;
 use super::plane::wall_ns;
 use crate::lane::calls::CallAnswer;
-use crate::types::media::{CALL_FAULT, CALL_REPLY, Media};
 use crate::types::{ConvertFailure, Encoding, MessageType, Types};
+use blaze_domain::media::{CALL_FAULT, CALL_REPLY, Media};
 
 /// Answers calls until the flow ends.
 pub(super) async fn answer_calls(shared: Arc<Shared>, stop: CancellationToken) {
@@ -28,14 +28,14 @@ pub(super) async fn answer_calls(shared: Arc<Shared>, stop: CancellationToken) {
                 CallAnswer::Reply(reply) => match to_json(&shared.types, reply.clone()).await {
                     Ok(reply) => Some(reply),
                     Err(failure) => {
-                        let error = error_of(&failure, "");
+                        let error = error_of(&failure, false);
                         reply.related().and_then(|of| {
                             faults.answer(&shared, reply.topic(), of, reply.to(), &error)
                         })
                     }
                 },
                 CallAnswer::Failed { request, failure } => {
-                    let error = error_of(&failure, "/request");
+                    let error = error_of(&failure, true);
                     let to = format!("{}/{}", request.origin_layer(), request.origin_node());
                     let topic = request.topic().strip_suffix("/_request").unwrap_or_default();
                     let (topic, of) =
@@ -68,23 +68,18 @@ async fn to_json(types: &Arc<Types>, reply: Frame) -> Result<Frame, ConvertFailu
     tokio::task::spawn_blocking(convert).await.map_err(failed)?
 }
 
-/// What a caller gets to know. `within`: where in the call the value is that was converted.
-fn error_of(failure: &ConvertFailure, within: &str) -> ControlError {
+/// What a caller gets to know of its request, or of the reply, that was not converted.
+fn error_of(failure: &ConvertFailure, is_request: bool) -> ControlError {
     let code = match failure.code {
         WhyCode::TypeUnknown => ErrorCode::TypeUnknown,
         WhyCode::TooLarge => ErrorCode::TooLarge,
         _ => ErrorCode::ConvertError,
     };
-    let (place, detail) = match failure.detail.split_once(": ") {
-        Some((place, detail)) if place.starts_with('/') && !within.is_empty() => (place, detail),
-        _ => ("", failure.detail.as_str()),
-    };
-    let pointer = if code == ErrorCode::TypeUnknown || within.is_empty() {
-        "/topic".to_owned()
+    if is_request && code != ErrorCode::TypeUnknown {
+        ControlError::new(code, format!("/request{}", failure.pointer), &*failure.detail)
     } else {
-        format!("{within}{place}")
-    };
-    ControlError::new(code, pointer, detail)
+        ControlError::new(code, "/topic", failure.to_string())
+    }
 }
 
 /// Faults of this flow: they go instead of replies.
@@ -136,28 +131,17 @@ mod tests {
 
     #[test]
     fn a_fault_names_the_place_in_the_call() {
-        let of = |code, detail: &str, within| {
-            let error = error_of(&ConvertFailure::new(code, detail), within);
-            (error.code.as_str(), error.pointer, error.detail)
-        };
-        let told = |code: &'static str, pointer: &str, detail: &str| {
-            (code, pointer.to_owned(), detail.to_owned())
-        };
-        assert_eq!(
-            of(WhyCode::ConvertError, "/a: expected a number, found text", "/request"),
-            told("convert_error", "/request/a", "expected a number, found text"),
-        );
-        assert_eq!(
-            of(WhyCode::ConvertError, "it ends early", "/request"),
-            told("convert_error", "/request", "it ends early"),
-        );
-        assert_eq!(
-            of(WhyCode::TypeUnknown, "no definition of a/srv/B_Request", "/request"),
-            told("type_unknown", "/topic", "no definition of a/srv/B_Request"),
-        );
-        assert_eq!(
-            of(WhyCode::ConvertError, "/sum: too short", ""),
-            told("convert_error", "/topic", "/sum: too short"),
-        );
+        let (convert, unknown) = (WhyCode::ConvertError, WhyCode::TypeUnknown);
+        for (code, pointer, detail, is_request, expected) in [
+            (convert, "/a", "found: text", true, ("convert_error", "/request/a", "found: text")),
+            (convert, "", "/a: lies", true, ("convert_error", "/request", "/a: lies")),
+            (unknown, "", "no a/srv/B", true, ("type_unknown", "/topic", "no a/srv/B")),
+            (convert, "/sum", "short", false, ("convert_error", "/topic", "/sum: short")),
+        ] {
+            let pointer = pointer.to_owned();
+            let failure = ConvertFailure { pointer, ..ConvertFailure::new(code, detail) };
+            let error = error_of(&failure, is_request);
+            assert_eq!((error.code.as_str(), &*error.pointer, &*error.detail), expected);
+        }
     }
 }

@@ -178,7 +178,7 @@ impl ControlTask {
     fn report_failures(&self) {
         let failures = self.shared.plane.read(|state| state.core.take_convert_failures());
         for (topic, failure) in failures {
-            self.shared.control.lock().convert_failed(wall_ms(), topic, failure);
+            self.shared.control.lock().convert_failed(wall_ms(), topic, &failure);
         }
     }
 

@@ -7,7 +7,7 @@
 //! ```
 //!
 //! Nothing waits for it but whoever wants the definition, and all of it is bounded: wishes that
-//! wait, those that are looked after at once, tries and time for each, and what is kept.
+//! wait, those that are looked after at once, the time for each, and what is kept.
 
 mod node;
 
@@ -18,29 +18,25 @@ use std::time::{Duration, Instant};
 use blaze_convert::{Definition, TypeDescription, definition_text, parse_joined};
 use blaze_domain::{FlowId, Scope};
 use blaze_proto::link::link_control::{Body, TypeDefinition, TypeRequest};
-use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use futures::{StreamExt as _, stream};
 use parking_lot::Mutex;
 use tokio::sync::{mpsc, oneshot};
+use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use super::Shared;
-use crate::types::{MessageType, Others, Parts, Types, Wish, parts_of, seek};
+use crate::types::{MessageType, Others, Parts, SEARCH, Types, Wish, parts_of, seek};
 use crate::world::{Reach, TopicEntry};
 
 /// Wishes that wait.
 const MAX_WISHES: usize = 256;
 /// Wishes that are looked after at once.
-const TASKS: usize = 8;
-/// How often a flow is asked, and how long it has each time. It may have to ask a node first.
-const TRIES: usize = 6;
-const ANSWER: Duration = Duration::from_secs(2);
-/// How long somebody waits who asks for a definition by HTTP.
-const LONGEST_SEARCH: Duration = Duration::from_secs(15);
+const AT_ONCE: usize = 8;
+/// After this time without an answer a node or flow is asked again.
+const ANSWER: Duration = Duration::from_millis(1500);
 /// Longest name of a type in a request, and longest hash.
 const MAX_NAME: usize = 255;
 const MAX_HASH: usize = 80;
-
-type Queue = Arc<tokio::sync::Mutex<mpsc::Receiver<Wish>>>;
 
 /// What is asked of other flows, and by them.
 pub(crate) struct Definitions {
@@ -64,6 +60,16 @@ impl Definitions {
 
     pub(super) fn wishes(&self) -> mpsc::Sender<Wish> {
         self.wishes.clone()
+    }
+
+    /// Remembers what a flow is asked for, until its answer is no longer waited for.
+    fn ask(&self, flow: &FlowId, ty: &MessageType) -> oneshot::Receiver<String> {
+        let (done, came) = oneshot::channel();
+        let mut all = self.asked.lock();
+        all.retain(|_, asked| asked.done.as_ref().is_some_and(|done| !done.is_closed()));
+        let asked = Asked { parts: Parts::default(), done: Some(done) };
+        all.insert((flow.clone(), ty.clone()), asked);
+        came
     }
 
     /// Takes what another flow asks for, or answers. Who gets no answer asks again.
@@ -101,26 +107,16 @@ impl Definitions {
 }
 
 /// Looks after wishes until the process ends.
-pub(super) fn start(shared: &Arc<Shared>, wishes: mpsc::Receiver<Wish>, supervisor: &Supervisor) {
-    let queue: Queue = Arc::new(tokio::sync::Mutex::new(wishes));
-    for _ in 0..TASKS {
-        let run = run(Arc::clone(shared), Arc::clone(&queue), supervisor.shutdown_token());
-        supervisor.spawn("types", TaskPolicy::Essential, run);
-    }
-}
-
-async fn run(shared: Arc<Shared>, queue: Queue, stop: CancellationToken) {
-    loop {
-        let next = async { queue.lock().await.recv().await };
-        let wish = tokio::select! {
-            () = stop.cancelled() => return,
-            wish = next => wish,
-        };
-        let Some(wish) = wish else { return };
-        tokio::select! {
-            () = stop.cancelled() => return,
-            () = look_after(&shared, wish) => {}
-        }
+pub(super) async fn run(
+    shared: Arc<Shared>,
+    mut wishes: mpsc::Receiver<Wish>,
+    stop: CancellationToken,
+) {
+    let wishes = stream::poll_fn(move |context| wishes.poll_recv(context));
+    let all = wishes.for_each_concurrent(AT_ONCE, |wish| look_after(&shared, wish));
+    tokio::select! {
+        () = stop.cancelled() => {}
+        () = all => {}
     }
 }
 
@@ -167,7 +163,7 @@ pub(super) async fn wait_for(types: &Arc<Types>, ty: MessageType) -> Option<Defi
     types.prepare(Instant::now(), ty.borrowed());
     let search = async { while types.is_sought(&ty) && searches.changed().await.is_ok() {} };
     // It goes on for others; here it counts as not found.
-    let _ = tokio::time::timeout(LONGEST_SEARCH, search).await;
+    let _ = timeout(SEARCH, search).await;
     find().await.flatten()
 }
 
@@ -222,21 +218,14 @@ impl Others for Around<'_> {
     }
 
     async fn ask_flow(&self, flow: &FlowId, ty: &MessageType) -> Option<TypeDescription> {
-        let (done, mut came) = oneshot::channel();
-        let key = (flow.clone(), ty.clone());
-        let asked = Asked { parts: Parts::default(), done: Some(done) };
-        self.0.definitions.asked.lock().insert(key.clone(), asked);
-        let mut text = None;
-        for _ in 0..TRIES {
+        let mut came = self.0.definitions.ask(flow, ty);
+        let text = loop {
             let request = TypeRequest { r#type: ty.name.clone(), hash: ty.hash.clone() };
             self.0.send_types(flow, Body::TypeRequest(request));
-            if let Ok(answer) = tokio::time::timeout(ANSWER, &mut came).await {
-                text = answer.ok();
-                break;
+            if let Ok(answer) = timeout(ANSWER, &mut came).await {
+                break answer.ok().filter(|text| !text.is_empty())?;
             }
-        }
-        self.0.definitions.asked.lock().remove(&key);
-        let text = text.filter(|text| !text.is_empty())?;
+        };
         match parse_joined(&ty.name, &text, None) {
             Ok(description) => Some(description),
             Err(error) => {
@@ -285,9 +274,7 @@ mod tests {
     fn only_parts_that_were_asked_for_are_taken() {
         let (definitions, _wishes) = Definitions::new();
         let ty = MessageType { name: TYPE.to_owned(), hash: String::new() };
-        let (done, mut came) = oneshot::channel();
-        let asked = Asked { parts: Parts::default(), done: Some(done) };
-        definitions.asked.lock().insert((flow(1), ty.clone()), asked);
+        let mut came = definitions.ask(&flow(1), &ty);
         let other = MessageType { name: "a/msg/C".to_owned(), ..ty.clone() };
         for (from, of) in [(2, &ty), (1, &other)] {
             for part in parts_of(of, Some("int8 lie\n")) {
@@ -301,6 +288,7 @@ mod tests {
             definitions.take(flow(1), Body::TypeDefinition(part));
         }
         assert_eq!(came.try_recv().unwrap(), text);
-        assert_eq!(definitions.asked.lock().len(), 1, "who asked takes it out");
+        let _came = definitions.ask(&flow(2), &ty);
+        assert_eq!(definitions.asked.lock().len(), 1, "what was answered is forgotten");
     }
 }

@@ -328,7 +328,8 @@ pub async fn start_with(
     };
     let control = supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
     watch_brokers(&shared, &supervisor, epoch);
-    definitions::start(&shared, wishes, &supervisor);
+    let search = definitions::run(Arc::clone(&shared), wishes, supervisor.shutdown_token());
+    supervisor.spawn("types", TaskPolicy::Essential, search);
     if shared.ros2.is_some() {
         let follow = ros2::follow_network(Arc::clone(&shared), supervisor.shutdown_token());
         supervisor.spawn("network", TaskPolicy::Essential, follow);

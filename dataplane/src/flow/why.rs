@@ -149,7 +149,7 @@ fn facts_of(bridge: &mut Bridge) -> BridgeFacts {
             .unconverted
             .as_ref()
             .filter(|last| last.at.elapsed() < SHOWN)
-            .map(|last| (last.failure.code, last.failure.detail.clone())),
+            .map(|last| (last.failure.code, last.failure.to_string())),
     }
 }
 

@@ -20,15 +20,13 @@ use lru::LruCache;
 use super::admit::Admitted;
 use super::core::{DataCore, LaneLink};
 use crate::types::ConvertFailure;
-use crate::types::media::{CALL, Media};
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY, Media};
 
-/// Requests of this flow whose replies are waited for; more than the flow lets wait, since those
-/// whose time is over are not taken out.
-const MAX_AWAITED: usize = 1_024;
 /// Calls that own servers have not answered; the oldest are given up.
 const MAX_SERVED: usize = 4_096;
-/// Answers that wait for the task that makes JSON of them; more are given up.
-const MAX_ANSWERS: usize = 1_024;
+/// Replies that wait for the control core, and answers that wait for the task that makes JSON of
+/// them; more are given up.
+const MAX_WAITING: usize = 1_024;
 
 /// Writer and number of a request.
 type Request = (WriterId, u64);
@@ -49,7 +47,6 @@ pub enum CallAnswer {
 
 /// Calls of this flow, and of others to its servers.
 pub(super) struct Calls {
-    awaited: LruCache<Request, ()>,
     arrived: Vec<Frame>,
     served: LruCache<Request, ()>,
     answers: Vec<CallAnswer>,
@@ -57,13 +54,8 @@ pub(super) struct Calls {
 
 impl Default for Calls {
     fn default() -> Self {
-        let room = |most| NonZeroUsize::new(most).unwrap_or(NonZeroUsize::MIN);
-        Self {
-            awaited: LruCache::new(room(MAX_AWAITED)),
-            arrived: Vec::new(),
-            served: LruCache::new(room(MAX_SERVED)),
-            answers: Vec::new(),
-        }
+        let room = NonZeroUsize::new(MAX_SERVED).unwrap_or(NonZeroUsize::MIN);
+        Self { arrived: Vec::new(), served: LruCache::new(room), answers: Vec::new() }
     }
 }
 
@@ -79,14 +71,14 @@ impl Calls {
     pub(super) fn note_failed(&mut self, request: &Frame, failure: &ConvertFailure) {
         if self.served.pop(&(request.writer(), request.sequence())).is_some() {
             let (request, failure) = (request.clone(), failure.clone());
-            self.answer(CallAnswer::Failed { request, failure });
+            keep(&mut self.answers, CallAnswer::Failed { request, failure });
         }
     }
+}
 
-    fn answer(&mut self, answer: CallAnswer) {
-        if self.answers.len() < MAX_ANSWERS {
-            self.answers.push(answer);
-        }
+fn keep<T>(waiting: &mut Vec<T>, one: T) {
+    if waiting.len() < MAX_WAITING {
+        waiting.push(one);
     }
 }
 
@@ -100,12 +92,11 @@ impl DataCore {
         link: &mut dyn LaneLink,
     ) {
         let Some(topic) = self.find(request.topic()) else { return };
-        self.calls.awaited.put((request.writer(), request.sequence()), ());
         let mut batch = vec![Received::live(Content::Frame(request), now)];
         self.ingest(now, wall_ns, topic, Scope::Node, &mut batch, link);
     }
 
-    /// Replies to calls of this flow since the last time.
+    /// Replies to calls of this flow since the last time, whether it waits for them or not.
     pub fn take_arrived(&mut self) -> Vec<Frame> {
         std::mem::take(&mut self.calls.arrived)
     }
@@ -137,14 +128,14 @@ impl DataCore {
         let Some(request) = frame.related() else { return false };
         let is_cdr = matches!(Media::of(frame.encoding()), Media::Cdr { .. });
         if from == Scope::Ros2 && is_cdr && self.calls.served.pop(&request).is_some() {
-            self.calls.answer(CallAnswer::Reply(frame.clone()));
+            keep(&mut self.calls.answers, CallAnswer::Reply(frame.clone()));
             return true;
         }
-        let is_own = self.config.me.is_written(frame.to());
-        if is_own && self.calls.awaited.pop(&request).is_some() {
-            self.calls.arrived.push(frame.clone());
-            return true;
+        let is_answer = matches!(frame.encoding(), CALL_REPLY | CALL_FAULT)
+            && self.config.me.is_written(frame.to());
+        if is_answer {
+            keep(&mut self.calls.arrived, frame.clone());
         }
-        false
+        is_answer
     }
 }

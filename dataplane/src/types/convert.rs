@@ -11,8 +11,8 @@ use bytes::Bytes;
 
 use super::{MessageType, Types};
 
-/// Longest detail of a failure, in bytes. It may repeat a member's name from the message.
-const MAX_DETAIL: usize = 300;
+/// Longest pointer and longest detail of a failure, in bytes: a message may name any member.
+const MAX_TEXT: usize = 300;
 
 /// An encoding that payloads are converted to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -32,26 +32,22 @@ impl fmt::Display for Encoding {
     }
 }
 
-/// Why a message was not converted.
+/// Why a message was not converted. Its text is `/linear/x: expected a number, found text`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConvertFailure {
     /// `convert_error`, `type_unknown`, `type_mismatch` or `too_large`.
     pub code: WhyCode,
+    /// JSON pointer of the value; empty for the whole message.
+    pub pointer: String,
     /// For people.
     pub detail: String,
 }
 
 impl ConvertFailure {
-    /// A failure with a bounded detail.
+    /// A failure of the whole message, with a bounded detail.
     #[must_use]
     pub fn new(code: WhyCode, detail: impl Into<String>) -> Self {
-        let mut detail = detail.into();
-        if detail.len() > MAX_DETAIL {
-            let end = (0..=MAX_DETAIL).rev().find(|at| detail.is_char_boundary(*at));
-            detail.truncate(end.unwrap_or(0));
-            detail.push('…');
-        }
-        Self { code, detail }
+        Self { code, pointer: String::new(), detail: bounded(detail.into()) }
     }
 
     /// The reason that the message counts under.
@@ -65,13 +61,30 @@ impl ConvertFailure {
     }
 }
 
+fn bounded(mut text: String) -> String {
+    if text.len() > MAX_TEXT {
+        text.truncate(text.floor_char_boundary(MAX_TEXT));
+        text.push('…');
+    }
+    text
+}
+
+impl fmt::Display for ConvertFailure {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { pointer, detail, .. } = self;
+        write!(out, "{pointer}{}{detail}", if pointer.is_empty() { "" } else { ": " })
+    }
+}
+
 impl From<ConvertError> for ConvertFailure {
     fn from(error: ConvertError) -> Self {
-        let code = match error {
-            ConvertError::TooLarge => WhyCode::TooLarge,
-            ConvertError::Representation(_) | ConvertError::Value { .. } => WhyCode::ConvertError,
-        };
-        Self::new(code, error.to_string())
+        match error {
+            ConvertError::Value { pointer, text } => {
+                Self { pointer: bounded(pointer), ..Self::new(WhyCode::ConvertError, text) }
+            }
+            ConvertError::TooLarge => Self::new(WhyCode::TooLarge, error.to_string()),
+            ConvertError::Representation(_) => Self::new(WhyCode::ConvertError, error.to_string()),
+        }
     }
 }
 

@@ -13,7 +13,6 @@
 
 mod cache;
 mod convert;
-pub mod media;
 mod parts;
 mod seek;
 
@@ -35,7 +34,7 @@ use cache::Cache;
 pub use convert::{CompiledType, Conversion, ConvertFailure, Converted, Encoding};
 pub(crate) use parts::{Parts, parts_of};
 pub use seek::Wish;
-pub(crate) use seek::{Others, seek};
+pub(crate) use seek::{Others, SEARCH, seek};
 
 /// How long an unknown type is not sought again: a file may have come, or a node have answered.
 const RETRY: Duration = Duration::from_secs(5);

@@ -1,12 +1,18 @@
 //! Definitions that others have: the node of an endpoint, or the flow of a publisher.
 
+use std::time::Duration;
+
 use blaze_convert::{Source, TypeDescription, TypeHash};
 use blaze_domain::FlowId;
+use tokio::time::error::Elapsed;
+use tokio::time::{Instant, timeout};
 
 use super::{MessageType, Types};
 
 /// Nodes that are asked for one definition, and flows, at most each.
 const MAX_ASKED: usize = 4;
+/// How long a definition is sought.
+pub(crate) const SEARCH: Duration = Duration::from_secs(15);
 
 /// A type whose definition is wanted.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -26,40 +32,57 @@ pub(crate) trait Others {
     /// Flows that may have the definition.
     fn flows(&self, wish: &Wish) -> Vec<FlowId>;
 
-    /// Asks a node. `None`: it does not answer, or does not know the type.
+    /// Asks a node, until it answers. `None`: it does not know the type.
     async fn ask_node(&self, node: &str, ty: &MessageType) -> Option<TypeDescription>;
 
-    /// Asks a flow. `None`: it does not answer, or does not know the type.
+    /// Asks a flow, until it answers. `None`: it does not know the type.
     async fn ask_flow(&self, flow: &FlowId, ty: &MessageType) -> Option<TypeDescription>;
 }
 
 /// Seeks a definition with others, and adds it to what this flow has. What is not of the name and
-/// hash is passed over.
+/// hash is passed over. Each that is asked has an equal share of the time that is left.
 pub(crate) async fn seek(types: &Types, others: &impl Others, wish: &Wish) -> Option<Source> {
-    for (node, ty) in others.nodes(&wish.ty).await.into_iter().take(MAX_ASKED) {
-        let found = others.ask_node(&node, &ty).await;
-        if found.is_some_and(|found| add(types, Source::Node, &node, &ty, found)) {
+    let end = Instant::now() + SEARCH;
+    let (mut nodes, mut flows) = (others.nodes(&wish.ty).await, others.flows(wish));
+    nodes.truncate(MAX_ASKED);
+    flows.truncate(MAX_ASKED);
+    let mut left = nodes.len() + flows.len();
+    let mut share = || {
+        let share = (end - Instant::now()).div_f64(left as f64);
+        left -= 1;
+        share
+    };
+    for (node, ty) in nodes {
+        let found = timeout(share(), others.ask_node(&node, &ty)).await;
+        if add(types, Source::Node, &node, &ty, found) {
             return Some(Source::Node);
         }
     }
-    for flow in others.flows(wish).into_iter().take(MAX_ASKED) {
-        let found = others.ask_flow(&flow, &wish.ty).await;
-        let from = flow.to_string();
-        if found.is_some_and(|found| add(types, Source::Flow, &from, &wish.ty, found)) {
+    for flow in flows {
+        let found = timeout(share(), others.ask_flow(&flow, &wish.ty)).await;
+        if add(types, Source::Flow, &flow.to_string(), &wish.ty, found) {
             return Some(Source::Flow);
         }
     }
     None
 }
 
-/// Whether the definition was what was asked for, and there was room for it.
+/// Whether the definition came, was what was asked for, and there was room for it.
 fn add(
     types: &Types,
     source: Source,
     from: &str,
     ty: &MessageType,
-    found: TypeDescription,
+    found: Result<Option<TypeDescription>, Elapsed>,
 ) -> bool {
+    let found = match found {
+        Ok(Some(found)) => found,
+        Ok(None) => return false,
+        Err(_) => {
+            tracing::info!(from, r#type = ty.name, "asked for a definition, no answer");
+            return false;
+        }
+    };
     let (name, hash) = (&found.type_description.type_name, found.hash());
     let is_it =
         *name == ty.name && (ty.hash.is_empty() || ty.hash.parse() == Ok::<TypeHash, _>(hash));
@@ -85,6 +108,7 @@ fn add(
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
+    use std::future;
     use std::time::Instant;
 
     use blaze_convert::{Distro, parse_joined};
@@ -99,7 +123,7 @@ mod tests {
         parse_joined(name, text, None).unwrap()
     }
 
-    /// What nodes and flows answer, and who was asked.
+    /// What nodes and flows answer, and who was asked. One with `silent` in its name does not.
     #[derive(Default)]
     struct Fakes {
         nodes: Vec<(&'static str, String)>,
@@ -109,8 +133,11 @@ mod tests {
     }
 
     impl Fakes {
-        fn answer(&self, who: &str) -> Option<TypeDescription> {
+        async fn answer(&self, who: &str) -> Option<TypeDescription> {
             self.asked.lock().push(who.to_owned());
+            if who.contains("silent") {
+                future::pending::<()>().await;
+            }
             self.answers.get(who).cloned()
         }
     }
@@ -126,11 +153,11 @@ mod tests {
         }
 
         async fn ask_node(&self, node: &str, _: &MessageType) -> Option<TypeDescription> {
-            self.answer(node)
+            self.answer(node).await
         }
 
         async fn ask_flow(&self, flow: &FlowId, _: &MessageType) -> Option<TypeDescription> {
-            self.answer(&flow.to_string())
+            self.answer(&flow.to_string()).await
         }
     }
 
@@ -143,7 +170,7 @@ mod tests {
         (std::mem::take(&mut *fakes.asked.lock()), found, types)
     }
 
-    #[tokio::test]
+    #[tokio::test(start_paused = true)]
     async fn nodes_are_asked_before_flows_until_one_has_it() {
         let wanted = definition(TYPE, "int32 level\n");
         let hash = wanted.hash().to_string();
@@ -155,11 +182,14 @@ mod tests {
         };
         let (asked, found, _) = sought(&fakes, &hash).await;
         assert_eq!((asked, found), (vec!["/silent".into(), "/talker".into()], Some(Source::Node)));
-        fakes.nodes.clear();
+        let began = tokio::time::Instant::now();
+        fakes.nodes = vec![("/silent", hash.clone())];
         let (asked, found, _) = sought(&fakes, &hash).await;
-        assert_eq!((asked, found), (vec!["edge/a".into(), "edge/b".into()], Some(Source::Flow)));
-        fakes.answers.clear();
+        assert_eq!((asked.len(), found), (3, Some(Source::Flow)));
+        assert_eq!(began.elapsed(), SEARCH / 3, "its share of the time");
+        fakes.flows = vec!["edge/silent", "edge/silent"];
         assert_eq!(sought(&fakes, &hash).await.1, None);
+        assert_eq!(began.elapsed(), SEARCH / 3 + SEARCH);
     }
 
     #[tokio::test]

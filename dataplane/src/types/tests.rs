@@ -12,7 +12,7 @@ fn json(types: &Types, now: Instant, ty: MessageType<&str>, cdr: &[u8]) -> Resul
     let found = types.get(now, ty).and_then(|found| found.convert(Encoding::Json, cdr));
     found
         .map(|converted| String::from_utf8(converted.payload.to_vec()).unwrap())
-        .map_err(|failure| format!("{}: {}", failure.code, failure.detail))
+        .map_err(|failure| format!("{}: {}", failure.code, failure))
 }
 
 const SEVEN: &[u8] = &[0, 1, 0, 0, 7, 0, 0, 0];

@@ -6,7 +6,7 @@
 //!                               ─ ? ───▶ as before, until that time is over
 //! ```
 //!
-//! It lies in the layer's MongoDB ([`MongoLease`]), else in Redis ([`RedisLease`]), else it is
+//! It lies in the layer's MongoDB (`MongoLease`), else in Redis ([`RedisLease`]), else it is
 //! membership of a consumer group on the layer's Kafka ([`KafkaLease`]). Beside it lies how far
 //! services were told ([`Mark`]): the worker that takes over tells the rest. A node on Redis has a
 //! lease for the case that two workers run under its name: the one that was started last serves.

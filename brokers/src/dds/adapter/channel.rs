@@ -75,7 +75,7 @@ impl Channel {
         Profile {
             reliable: kind != Kind::BestEffort,
             transient_local: kind == Kind::Durable,
-            terms: self.topic.terms,
+            timing: self.topic.timing,
             ..Profile::best_effort(depth)
         }
     }

@@ -37,7 +37,7 @@ use parking_lot::Mutex;
 use rustdds::WriteOptionsBuilder;
 use tokio::sync::watch;
 
-use super::participant::Terms;
+use super::participant::TimingQos;
 use super::reader::StoppableThread;
 use super::{
     Cdr, DdsError, EndpointId, Endpoints, GuidPrefix, Participant, ParticipantConfig, Sample,
@@ -78,7 +78,7 @@ pub(crate) struct Topic {
     /// The topic as users name it.
     pub(crate) user: Arc<str>,
     pub(crate) type_name: Arc<str>,
-    pub(crate) terms: Terms,
+    pub(crate) timing: TimingQos,
 }
 
 /// A message as RustDDS is given it.

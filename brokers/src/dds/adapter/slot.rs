@@ -54,7 +54,7 @@ impl SlotKey {
             depth: if self.depth > 0 { self.depth } else { depth },
             transient_local: self.depth > 0,
             window: if self.reliable { window } else { 0 },
-            terms: self.topic.terms,
+            timing: self.topic.timing,
         }
     }
 }

@@ -6,7 +6,7 @@ use blaze_domain::names::ChannelName;
 
 use crate::dds::FRAME_TYPE;
 use crate::dds::adapter::Topic;
-use crate::dds::participant::Terms;
+use crate::dds::participant::TimingQos;
 
 /// Stands before user topics.
 pub(super) const USER_PREFIX: &str = "bt/";
@@ -21,7 +21,7 @@ pub(super) fn topic(channel: &ChannelName) -> Topic {
         Arc::from(format!("{USER_PREFIX}{channel}"))
     };
     let user = Arc::from(channel.as_str());
-    Topic { name, user, type_name: Arc::from(FRAME_TYPE), terms: Terms::default() }
+    Topic { name, user, type_name: Arc::from(FRAME_TYPE), timing: TimingQos::default() }
 }
 
 #[cfg(test)]

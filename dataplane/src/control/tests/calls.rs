@@ -6,7 +6,7 @@ use blaze_proto::link::link_control::{Advertise, RouteState};
 use blaze_proto::{Frame, Header};
 
 use super::*;
-use crate::types::media::{CALL, CALL_FAULT, CALL_REPLY};
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
 
 const ROBOT: &str = "edge/robot-1";
 
@@ -123,7 +123,7 @@ fn a_call_is_sent_when_its_ways_stand_and_its_reply_is_the_answer() {
     assert!(sent[1].writer() != request.writer() && sent[0].sequence() > request.sequence());
     let fault = r#"{"code":"convert_error","pointer":"/request/a","detail":"found text"}"#;
     bench.core.call_reply(&reply(&sent[1], CALL_FAULT, fault));
-    bench.core.call_reply(&reply(&sent[0], "application/cdr; type=a/srv/B_Response", ""));
+    bench.core.call_reply(&reply(&sent[0], CALL_REPLY, "no JSON"));
     let (_, answers) = work(&mut bench, 300);
     assert_eq!(codes(&answers), ["convert_error", "convert_error"]);
     assert_eq!(answers[0]["error"]["pointer"], "/request/a");
@@ -161,6 +161,22 @@ fn calls_are_bounded_and_held_to_the_rules() {
     assert_eq!(codes(&answers), [ErrorCode::TooManyCalls.as_str()]);
     assert_eq!(answers[0]["id"], "256");
     assert_eq!(work(&mut bench, 1_200).1.len(), 256);
+
+    // Of more callers of one service than are remembered the oldest gives way, not all of them.
+    robot(&mut bench, true);
+    bench.step(300);
+    for number in 0..257 {
+        let mut call = call("add", "1", 5_000);
+        call["service"] = format!("planner-{number}").into();
+        bench.send(Scope::Node, &call);
+        for request in work(&mut bench, 60).0 {
+            bench.core.call_reply(&reply(&request, CALL_REPLY, "{}"));
+        }
+    }
+    let own = bench.core.world().own().unwrap();
+    let replies = own.topics.get("add/_reply").and_then(|entry| entry.node.request.as_ref());
+    assert!(replies.unwrap().more_services > 0);
+    assert_eq!(codes(&work(&mut bench, 60).1), ["ok"]);
 
     let rules = [json!({"match": "add/**", "advertise": {"allow": ["*/*/other"]}})];
     bench.core.set_access(bench.now, 0, access(&json!(rules)));

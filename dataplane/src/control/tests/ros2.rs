@@ -124,8 +124,11 @@ fn json_becomes_what_readers_ask_for_if_the_publisher_names_no_other_type() {
 #[test]
 fn a_conversion_that_fails_is_an_event() {
     let mut bench = Bench::ready();
-    let failure = ConvertFailure::new(WhyCode::ConvertError, "/x: expected a number, found text");
-    bench.core.convert_failed(0, "chatter".parse().unwrap(), failure);
+    let failure = ConvertFailure {
+        pointer: "/x".to_owned(),
+        ..ConvertFailure::new(WhyCode::ConvertError, "expected a number, found text")
+    };
+    bench.core.convert_failed(0, "chatter".parse().unwrap(), &failure);
     bench.collect();
     let events = bench.wanted(|output| match output {
         Output::Publish { scope, channel, body } if channel == ChannelName::events() => {

@@ -1,71 +1,64 @@
 //! Asks a ROS 2 node for a definition: the flow is a client of its `get_type_description`.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::ros2::RosEndpoint;
 use blaze_brokers::ros2::names::{Carries, RosName};
+use blaze_brokers::ros2::{Network, RosEndpoint};
 use blaze_brokers::{Broker as _, Content, PublisherOptions, Received, SubscribeOptions};
 use blaze_convert::{DescriptionError, TypeDescription};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Origin, WriterId};
 use blaze_proto::{Frame, Header};
+use tokio::time::{timeout, timeout_at};
 
 use super::super::Shared;
 use super::super::plane::wall_ns;
-use super::super::ros2::{Ros2Scope, Seen};
-use super::agree;
+use super::super::ros2::Ros2Scope;
+use super::{ANSWER, agree};
 use crate::types::MessageType;
-use crate::types::media::cdr_of;
+use blaze_domain::media::cdr_of;
 
 const SERVICE: &str = "get_type_description";
 const REQUEST: &str = "type_description_interfaces/srv/GetTypeDescription_Request";
-/// How often a node is asked, and how long it has each time. The first request or reply may be
-/// lost, since client and server have to find each other.
-const TRIES: u64 = 4;
-const ANSWER: Duration = Duration::from_millis(1500);
-/// How long an endpoint's node and service may take to be known, and how often that is looked at.
+/// How long an endpoint's node and service may take to be known.
 const MEET: Duration = Duration::from_secs(5);
-const LOOK: Duration = Duration::from_millis(50);
 /// Replies that wait: to this client and others.
 const MAX_REPLIES: usize = 64;
 
 /// Nodes with endpoints of a type that have the service. An endpoint may be known before its node
 /// and the service are.
 pub(super) async fn nodes_with(ros2: &Ros2Scope, ty: &MessageType) -> Vec<(String, MessageType)> {
-    let until = Instant::now() + MEET;
-    loop {
-        let (has_endpoint, nodes) = look(&ros2.seen(), ty);
-        if !has_endpoint || !nodes.is_empty() || Instant::now() >= until {
-            return nodes;
-        }
-        tokio::time::sleep(LOOK).await;
-    }
+    let (mut network, mut nodes) = (ros2.broker.network(), Vec::new());
+    let known = network.wait_for(|network| look(network, ty).map(|it| nodes = it).is_some());
+    let _ = timeout(MEET, known).await;
+    nodes
 }
 
-/// Whether there are endpoints of a type, and their nodes that have the service, each with the hash
-/// that it announces: one without (Humble) has no service.
-fn look(seen: &[Seen], ty: &MessageType) -> (bool, Vec<(String, MessageType)>) {
+/// The nodes of endpoints of a type that have the service, each with the hash that it announces:
+/// one without (Humble) has no service. `None`: there are endpoints, and no such node yet.
+fn look(network: &Network, ty: &MessageType) -> Option<Vec<(String, MessageType)>> {
     let (mut has_endpoint, mut nodes) = (false, Vec::new());
-    for Seen { endpoint, .. } in seen {
+    for endpoint in &network.endpoints {
         let Some(hash) = &endpoint.type_hash else { continue };
         if endpoint.type_name.as_ref() != Some(&ty.name) || !agree(hash, &ty.hash) {
             continue;
         }
         has_endpoint = true;
-        for node in servers(seen, endpoint) {
+        for node in servers(&network.endpoints, endpoint) {
             let of = (node, MessageType { name: ty.name.clone(), hash: hash.clone() });
             if !nodes.contains(&of) {
                 nodes.push(of);
             }
         }
     }
-    (has_endpoint, nodes)
+    (!has_endpoint || !nodes.is_empty()).then_some(nodes)
 }
 
 /// The node of an endpoint, if it has the service. While the node is not told, all nodes of its
 /// participant: that is mostly one.
-fn servers(seen: &[Seen], endpoint: &RosEndpoint) -> impl Iterator<Item = String> {
-    let of_participant = seen.iter().map(|seen| &*seen.endpoint).filter(|other| {
+fn servers(all: &[Arc<RosEndpoint>], endpoint: &RosEndpoint) -> impl Iterator<Item = String> {
+    let of_participant = all.iter().filter(|other| {
         !other.is_writer
             && other.name.carries == Carries::Requests
             && other.id[..12] == endpoint.id[..12]
@@ -82,7 +75,7 @@ fn requests_of(node: &str) -> RosName {
     RosName { name, carries: Carries::Requests }
 }
 
-/// Asks a node; `None` where it does not answer, or does not know the type.
+/// Asks a node until it answers; `None`: it does not know the type, or cannot be asked.
 pub(super) async fn ask(shared: &Shared, node: &str, ty: &MessageType) -> Option<TypeDescription> {
     let ros2 = shared.ros2.as_ref()?;
     match call(shared, ros2, node, ty).await {
@@ -117,18 +110,20 @@ async fn call(
         epoch: 0,
     };
     let writer = WriterId(rand::random());
-    let mut batch = Vec::new();
-    for sequence in 1..=TRIES {
+    let (mut batch, mut sequence) = (Vec::new(), 0);
+    // The first request or reply may be lost, since client and server have to find each other.
+    loop {
+        sequence += 1;
         let header = Header {
             encoding: cdr_of(REQUEST),
             reliable: true,
             ..Header::new(topic.as_str(), origin.clone(), writer, sequence, wall_ns())
         };
         let frame = Frame::new(&header, payload.clone().into())?;
-        requests.publish(&frame, Some(Instant::now() + ANSWER));
-        let until = tokio::time::Instant::now() + ANSWER;
+        let again = Instant::now() + ANSWER;
+        requests.publish(&frame, Some(again));
         while let Ok(count) =
-            tokio::time::timeout_at(until, replies.receive(&mut batch, MAX_REPLIES)).await
+            timeout_at(again.into(), replies.receive(&mut batch, MAX_REPLIES)).await
         {
             anyhow::ensure!(count > 0, "the ROS 2 network has gone");
             if let Some(reply) = batch.drain(..).find_map(|reply| reply_to(writer, reply)) {
@@ -136,7 +131,6 @@ async fn call(
             }
         }
     }
-    anyhow::bail!("no answer to {TRIES} requests")
 }
 
 /// The reply to one of the own requests, whichever.

@@ -21,8 +21,8 @@ use crate::lane::core::DataCore;
 use crate::lane::measure::micros;
 use crate::lane::path::{BridgeState, Phase, TopicId, TopicInfo};
 use crate::plan::Target;
-use crate::types::media::{JSON, Media, cdr_of};
 use crate::types::{Conversion, ConvertFailure, Converted, Encoding, MessageType, Wanted};
+use blaze_domain::media::{JSON, Media, cdr_of};
 
 /// Smaller payloads are converted by the thread that brings them.
 const INLINE_BELOW: usize = 16 * 1024;

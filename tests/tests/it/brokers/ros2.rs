@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    Cdr, EndpointId, Participant, ParticipantConfig, Profile, Reader, Sample, Terms, Writer,
+    Cdr, EndpointId, Participant, ParticipantConfig, Profile, Reader, Sample, TimingQos, Writer,
     Written,
 };
 use blaze_brokers::ros2::{GidLength, Network, Ros2Broker, Ros2Config, Shown};
@@ -105,6 +105,22 @@ fn number(received: &Received) -> u8 {
     }
 }
 
+/// What writers write until a reader gets it: it may know its writer later than that knows it.
+const GREETING: u8 = 0;
+
+/// Waits until a subscription gets what is written.
+async fn meet(writer: &Writer, subscription: &mut Subscription) {
+    let meet = async {
+        let (mut found, pause) = (Vec::new(), Duration::from_millis(50));
+        while found.is_empty() {
+            put(writer, GREETING);
+            let received = subscription.receive(&mut found, usize::MAX);
+            let _ = tokio::time::timeout(pause, received).await;
+        }
+    };
+    assert!(tokio::time::timeout(DEADLINE, meet).await.is_ok(), "they have not met");
+}
+
 /// Reads until a message with this number came.
 async fn until(subscription: &mut Subscription, last: u8) -> Vec<u8> {
     let mut found = Vec::new();
@@ -114,7 +130,7 @@ async fn until(subscription: &mut Subscription, last: u8) -> Vec<u8> {
         }
     };
     let waited = tokio::time::timeout(DEADLINE, read).await;
-    let numbers = found.iter().map(number).collect();
+    let numbers = found.iter().map(number).filter(|number| *number != GREETING).collect();
     assert!(waited.is_ok(), "{last} has not come: {numbers:?}");
     numbers
 }
@@ -128,15 +144,19 @@ async fn what_the_flow_writes_leaves_room_for_samples_that_wait_for_an_owner() {
     let mut subscription = net.read("a", SubscribeOptions::default()).await;
     net.network("both", |network| network.endpoints.len() == 2).await;
     let publisher = net.broker.publisher(&"a".parse().unwrap(), RELIABLE).unwrap();
-    eventually("matched", || writer.is_matched().then_some(())).await;
-    tokio::time::sleep(Duration::from_millis(200)).await;
+    let waits = || (net.broker.counts().undecided_bytes > 0).then_some(());
+    eventually("a sample waits", || {
+        put(&writer, GREETING);
+        waits()
+    })
+    .await;
     put(&writer, 1);
     for _ in 0..3_000 {
         publisher.publish(&frame("a", 7, 9), None);
     }
     eventually("written", || (publisher.later().queued == 0).then_some(())).await;
     put(&writer, 2);
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    eventually("acknowledged", || writer.is_acknowledged().then_some(())).await;
     net.own(&[writer.id()]).await;
     assert_eq!(until(&mut subscription, 2).await, [1, 2]);
     assert_eq!(subscription.take_dropped(), 0);
@@ -156,8 +176,7 @@ async fn what_is_kept_is_read_beside_other_writers_of_the_topic() {
     let best_effort = node.typed_writer(("rt/map", TYPE), Profile::best_effort(8)).unwrap();
     net.own(&[kept.id(), reliable.id(), best_effort.id()]).await;
     for (writer, number) in [(&reliable, 4), (&best_effort, 5), (&kept, 6)] {
-        eventually("matched", || writer.is_matched().then_some(())).await;
-        tokio::time::sleep(Duration::from_millis(200)).await;
+        meet(writer, &mut subscription).await;
         put(writer, number);
         assert_eq!(until(&mut subscription, number).await, [number]);
     }
@@ -191,9 +210,9 @@ impl Reads {
     }
 }
 
-fn with_terms(profile: Profile, deadline_s: Option<u64>, manual: bool) -> Profile {
+fn with_timing(profile: Profile, deadline_s: Option<u64>, manual: bool) -> Profile {
     let deadline = deadline_s.map(Duration::from_secs);
-    Profile { terms: Terms { deadline, manual, ..Terms::default() }, ..profile }
+    Profile { timing: TimingQos { deadline, manual, ..TimingQos::default() }, ..profile }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -209,7 +228,7 @@ async fn each_message_comes_once_while_readers_with_other_demands_come_and_go() 
         // Twice others come, and go after a while.
         match number {
             20 | 130 => {
-                let profile = with_terms(reliable(256), Some(10), number == 130);
+                let profile = with_timing(reliable(256), Some(10), number == 130);
                 other = Some(Reads::start(&guest, "rt/a", profile));
             }
             90 | 200 => drop(other.take()),
@@ -242,7 +261,7 @@ async fn what_was_published_for_late_joiners_survives_other_writers() {
     let mut found = early.until(4).await;
     found.sort_unstable();
     assert!(found.ends_with(&[2, 3, 4]), "{found:?}");
-    let late = Reads::start(&guest, "rt/map", with_terms(keeping(16), Some(10), false));
+    let late = Reads::start(&guest, "rt/map", with_timing(keeping(16), Some(10), false));
     eventually("what was kept", || {
         let mut found = late.found.lock().clone();
         found.sort_unstable();
@@ -263,7 +282,7 @@ async fn a_reader_that_asks_for_more_than_is_published_is_served() {
         net.broker.publisher(&"a".parse().unwrap(), PublisherOptions::default()).unwrap();
     let readers = [
         Reads::start(&node, "rt/a", keeping(16)),
-        Reads::start(&guest, "rt/a", with_terms(Profile::best_effort(16), None, true)),
+        Reads::start(&guest, "rt/a", with_timing(Profile::best_effort(16), None, true)),
     ];
     net.network("the readers", |network| network.endpoints.len() == 2).await;
     let until = Instant::now() + DEADLINE;
@@ -374,9 +393,8 @@ async fn types_of_one_topic_are_read_apart_and_no_gap_of_one_counts_for_another(
     let writers = types.map(|it| node.typed_writer(("rt/a", it), reliable(8)).unwrap());
     net.own(&writers.each_ref().map(Writer::id)).await;
     for writer in &writers {
-        eventually("matched", || writer.is_matched().then_some(())).await;
+        meet(writer, &mut subscription).await;
     }
-    tokio::time::sleep(Duration::from_millis(300)).await;
     for (round, number) in [(0, 1), (1, 2), (0, 3)] {
         put(&writers[round], number);
         assert_eq!(until(&mut subscription, number).await, [number]);
@@ -397,8 +415,7 @@ async fn types_of_one_topic_are_read_apart_and_no_gap_of_one_counts_for_another(
     tokio::time::sleep(Duration::from_secs(5)).await;
     let writer = node.typed_writer(("rt/a", TYPE), reliable(8)).unwrap();
     net.own(&[writer.id()]).await;
-    eventually("matched", || writer.is_matched().then_some(())).await;
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    meet(&writer, &mut subscription).await;
     put(&writer, 30);
     assert_eq!(until(&mut subscription, 30).await, [30]);
 }
@@ -478,8 +495,8 @@ async fn a_request_to_a_server_that_only_shows_waits_until_somebody_reads_it() {
     net.own(&[client.id()]).await;
     eventually("matched", || client.is_matched().then_some(())).await;
     put(&client, 1);
-    eventually("acknowledged", || client.is_acknowledged().then_some(())).await;
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    let waits = || (net.broker.counts().undecided_bytes > 0).then_some(());
+    eventually("it waits", waits).await;
     let mut subscription = net.read("add/_request", SubscribeOptions::default()).await;
     assert_eq!(until(&mut subscription, 1).await, [1]);
     put(&client, 2);

@@ -6,17 +6,16 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use blaze_flow::types::{Encoding, MessageType, Types};
 use blaze_tests::flow::{FlowProcess, FlowSpec};
-use blaze_tests::network::{Host, Plan, Topology, inside};
 use blaze_tests::plain::{KafkaReader, KafkaWriter, RedisReader, publish, tell_kafka, tell_redis};
-use blaze_tests::ros2::{Message, Peer, Quality, Release, open_loopback};
-use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer};
+use blaze_tests::ros2::{Message, Peer, Quality, Release};
+use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisServer};
 use blaze_tests::wait;
-use blaze_tests::wan::{Shape, Ways};
+use blaze_tests::wan::Ways;
 use bytes::Bytes;
 use serde_json::{Value, json};
 use sha2::Digest as _;
 
-use super::support::{ARRIVE, DOMAIN, LINK_DOMAIN, MEET, NODE};
+use super::support::{ARRIVE, DEEP, DOMAIN, LINK_DOMAIN, MEET, NODE, Pair, redis, state};
 
 const ODOMETRY: &str = "nav_msgs/msg/Odometry";
 const TWIST: &str = "geometry_msgs/msg/Twist";
@@ -45,57 +44,41 @@ fn odometry(x: f64) -> Value {
     json!({ "header": { "frame_id": "odom" }, "pose": { "pose": { "position": { "x": x } } } })
 }
 
+struct Brokers {
+    robot: RedisServer,
+    fog: RedisServer,
+    kafka: KafkaServer,
+}
+
 /// A robot with ROS 2 and Redis, a cloud with Kafka, and in the same building a fog with Redis;
 /// dropped in this order.
 struct World {
-    edge: FlowProcess,
-    cloud: FlowProcess,
     fog: FlowProcess,
-    robot_redis: RedisServer,
-    fog_redis: RedisServer,
-    kafka: KafkaServer,
-    network: Topology,
+    pair: Pair<Brokers>,
 }
 
 impl World {
     fn start() -> anyhow::Result<Self> {
-        let network = Topology::build(&Plan::two_hosts("robot", "cloud", Shape::to_cloud()))?;
-        let (robot, cloud) = (network.host("robot")?, network.host("cloud")?);
-        open_loopback(robot)?;
-        let redis = |host: &Host| {
-            let options = RedisOptions { host: Some(host.clone()), ..RedisOptions::default() };
-            RedisServer::start(RedisKind::Redis, options)
-        };
-        let (robot_redis, fog_redis) = (redis(robot)?, redis(cloud)?);
-        let options = KafkaOptions { host: Some(cloud.clone()), ..KafkaOptions::default() };
-        let kafka = KafkaServer::start(options)?;
-        let flow = |layer, node, host, peers: &[_]| {
-            FlowSpec::new(layer, node).joined(LINK_DOMAIN).inside(host, peers)
-        };
-        let edge = flow("edge", "robot-1", robot, &[cloud.address]).on_ros2(DOMAIN);
-        let mut edge = FlowProcess::launch(edge.on_redis(&robot_redis.url(), ""))?;
-        let fog = flow("fog", "fog-1", cloud, &[]).on_redis(&fog_redis.url(), "");
-        let mut fog = FlowProcess::launch(fog)?;
-        let cloud = flow("cloud", "cloud-1", cloud, &[]).on_kafka(&kafka.bootstrap(), "");
-        let mut cloud = FlowProcess::launch(cloud)?;
-        for flow in [&mut edge, &mut cloud, &mut fog] {
-            flow.wait_ready()?;
-        }
-        Ok(Self { edge, cloud, fog, robot_redis, fog_redis, kafka, network })
-    }
-
-    /// Does something on a host.
-    fn on<T: Send>(
-        &self,
-        host: &str,
-        act: impl FnOnce() -> anyhow::Result<T> + Send,
-    ) -> anyhow::Result<T> {
-        inside(&self.network.host(host)?.namespace, act)
+        let pair = Pair::on(
+            |robot, cloud| {
+                let options = KafkaOptions { host: Some(cloud.clone()), ..KafkaOptions::default() };
+                let kafka = KafkaServer::start(options)?;
+                Ok(Brokers { robot: redis(robot)?, fog: redis(cloud)?, kafka })
+            },
+            |brokers, edge, cloud| {
+                let edge = edge.on_ros2(DOMAIN).on_redis(&brokers.robot.url(), "");
+                [edge, cloud.on_kafka(&brokers.kafka.bootstrap(), "")]
+            },
+        )?;
+        let fog = FlowSpec::new("fog", "fog-1").joined(LINK_DOMAIN);
+        let fog = fog.on_redis(&pair.brokers.fog.url(), "");
+        let fog = FlowProcess::start(fog.inside(pair.network.host("cloud")?, &[]))?;
+        Ok(Self { fog, pair })
     }
 
     /// A control message to a flow on Redis.
     fn tell(&self, host: &str, redis: &RedisServer, message: &Value) -> anyhow::Result<()> {
-        self.on(host, || tell_redis(&redis.url(), "", message))
+        self.pair.inside(host, || tell_redis(&redis.url(), "", message))
     }
 
     /// What a plain client of a Redis reads on a channel.
@@ -105,15 +88,11 @@ impl World {
         redis: &RedisServer,
         channel: &str,
     ) -> anyhow::Result<RedisReader> {
-        self.on(host, || RedisReader::new(&redis.url(), channel))
+        self.pair.inside(host, || RedisReader::new(&redis.url(), channel))
     }
 
     fn state(&self, topic: &str) -> String {
-        let of = |flow: &FlowProcess| {
-            let why = flow.why(topic, None).unwrap_or_default();
-            format!("{}: {:?} {why}\n{}\n", flow.spec.layer, flow.bridges(), flow.tail())
-        };
-        [&self.edge, &self.cloud, &self.fog].map(of).concat()
+        format!("{}\n{}", self.pair.state(topic), state(&self.fog, topic))
     }
 }
 
@@ -125,8 +104,7 @@ fn send(publisher: &Peer, end: &str, cdr: &[u8]) -> anyhow::Result<()> {
 #[test]
 fn odometry_reaches_redis_and_kafka_and_commands_come_back_as_json() -> anyhow::Result<()> {
     let world = World::start()?;
-    let peer = Peer::start(Release::Jazzy, world.network.host("robot")?, DOMAIN)?;
-    peer.node(NODE)?;
+    let peer = world.pair.on_robot(Release::Jazzy)?;
     peer.ask(&json!({
         "op": "publisher", "name": "odom", "node": NODE, "topic": "/odom", "type": ODOMETRY,
         "qos": Quality::default(),
@@ -136,19 +114,19 @@ fn odometry_reaches_redis_and_kafka_and_commands_come_back_as_json() -> anyhow::
             "reliability": "reliable", "ttl_s": 0 })
     };
     // The robot's own Redis: CDR without a header.
-    world.tell("robot", &world.robot_redis, &request("logger", "bare"))?;
-    let mut on_robot = world.reader("robot", &world.robot_redis, "blaze/bare/odom")?;
+    world.tell("robot", &world.pair.brokers.robot, &request("logger", "bare"))?;
+    let mut on_robot = world.reader("robot", &world.pair.brokers.robot, "blaze/bare/odom")?;
     // The fog's Redis: JSON.
-    world.tell("cloud", &world.fog_redis, &request("map", "json"))?;
-    let mut in_fog = world.reader("cloud", &world.fog_redis, "blaze/json/odom")?;
+    world.tell("cloud", &world.pair.brokers.fog, &request("map", "json"))?;
+    let mut in_fog = world.reader("cloud", &world.pair.brokers.fog, "blaze/json/odom")?;
     // The cloud's Kafka: CDR.
-    let kafka = world.kafka.bootstrap();
-    let in_cloud = world.on("cloud", || {
+    let kafka = world.pair.brokers.kafka.bootstrap();
+    let in_cloud = world.pair.inside("cloud", || {
         tell_kafka(&KafkaWriter::new(&kafka)?, "", &request("recorder", "bare"))?;
         KafkaReader::from_end(&kafka, "odom")
     })?;
     let expected = ["odom|ros2>inter|cloud", "odom|ros2>inter|fog", "odom|ros2>node|edge|bare"];
-    let bridges = || world.edge.bridges_up() == expected;
+    let bridges = || world.pair.edge.bridges_up() == expected;
     wait::until("one bridge to each broker", MEET, bridges, || world.state("odom"))?;
     // Until all have met: messages before are gone.
     let mut last = 0.0;
@@ -196,17 +174,18 @@ fn odometry_reaches_redis_and_kafka_and_commands_come_back_as_json() -> anyhow::
 
 /// Commands as JSON from the fog; those that are too old after a cut are not delivered.
 fn commands(world: &World, peer: &Peer) -> anyhow::Result<()> {
-    let deep = Quality { depth: 1_000, ..Quality::default() };
-    let obeys = peer.subscription(NODE, "/cmd_vel", TWIST, deep)?;
+    let obeys = peer.subscription(NODE, "/cmd_vel", TWIST, DEEP)?;
     let advertise = json!({
         "op": "advertise", "topic": "cmd_vel", "service": "pilot", "ttl_s": 0,
         "encoding": "application/json", "type": TWIST, "reliability": "reliable",
         "lifespan_ms": LIFESPAN.as_millis(),
     });
-    world.tell("cloud", &world.fog_redis, &advertise)?;
+    world.tell("cloud", &world.pair.brokers.fog, &advertise)?;
     let say = |command: &Value| {
         let text = command.to_string();
-        world.on("cloud", || publish(&world.fog_redis.url(), "cmd_vel", text.as_bytes()))
+        world
+            .pair
+            .inside("cloud", || publish(&world.pair.brokers.fog.url(), "cmd_vel", text.as_bytes()))
     };
     let command = |x: f64| json!({ "linear": { "x": x } });
     let came = |x: f64| -> anyhow::Result<bool> {
@@ -218,7 +197,7 @@ fn commands(world: &World, peer: &Peer) -> anyhow::Result<()> {
         say(&command(x)).is_ok() && (1..=x as u32).any(|x| came(x.into()).unwrap_or_default())
     };
     wait::until("a command arrives", MEET, meets, || world.state("cmd_vel"))?;
-    let link = world.network.link("robot", "cloud")?;
+    let link = world.pair.network.link("robot", "cloud")?;
     link.cut(Ways::Both)?;
     say(&command(-1.0))?;
     // The time during which it becomes too old is what is tested. The flows have not given each

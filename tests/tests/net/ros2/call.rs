@@ -10,14 +10,13 @@ use blaze_tests::network::{self, Host, Plan, Topology};
 use blaze_tests::plain::{self, RedisReader};
 use blaze_tests::process::binary;
 use blaze_tests::ros2::{Peer, Release, open_loopback};
-use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
+use blaze_tests::servers::RedisServer;
 use blaze_tests::wait;
 use blaze_tests::wan::Shape;
 use serde_json::{Value, json};
 
-use super::support::{ARRIVE, DOMAIN, MEET, NODE};
+use super::support::{ARRIVE, DOMAIN, LINK_DOMAIN, MEET, NODE, redis};
 
-const LINK_DOMAIN: u16 = 50;
 const REPLY_TO: &str = "blaze/reply/planner";
 
 /// A host with a Redis and a flow on it.
@@ -31,8 +30,7 @@ struct Site {
 impl Site {
     fn start(host: &Host, spec: FlowSpec) -> anyhow::Result<Self> {
         open_loopback(host)?;
-        let options = RedisOptions { host: Some(host.clone()), ..RedisOptions::default() };
-        let redis = RedisServer::start(RedisKind::Redis, options)?;
+        let redis = redis(host)?;
         let url = redis.url();
         let flow = FlowProcess::launch(spec.on_redis(&url, ""))?;
         let answers = network::inside(&host.namespace, || RedisReader::new(&url, REPLY_TO))?;

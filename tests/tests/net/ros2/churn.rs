@@ -5,20 +5,12 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_tests::process::Usage;
-use blaze_tests::ros2::{Quality, Release, Stream};
+use blaze_tests::ros2::{Release, Stream};
 use blaze_tests::wait;
 
-use super::support::{ARRIVE, MEET, NODE, Pair};
+use super::support::{ARRIVE, DEEP, MEET, NODE, Pair};
 
 const KIND: &str = "std_msgs/msg/String";
-const DEEP: Quality = Quality {
-    reliable: true,
-    durable: false,
-    depth: 1_000,
-    deadline_ms: 0,
-    lease_ms: 0,
-    lifespan_ms: 0,
-};
 /// For what a flow holds to be as before: samples and ends of endpoints are kept for seconds.
 const SETTLES: Duration = Duration::from_secs(40);
 /// What a flow may hold beyond what it held before.

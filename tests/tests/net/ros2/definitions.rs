@@ -3,17 +3,14 @@
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use blaze_tests::flow::{FlowProcess, FlowSpec};
-use blaze_tests::network::{Host, Plan, Topology, inside};
-use blaze_tests::plain::{self, RedisReader};
-use blaze_tests::ros2::{Peer, Quality, Release, open_loopback};
-use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
-use blaze_tests::wan::Shape;
+use blaze_tests::flow::FlowProcess;
+use blaze_tests::plain::{RedisReader, tell_redis};
+use blaze_tests::ros2::{Quality, Release};
+use blaze_tests::servers::RedisServer;
 use serde_json::{Value, json};
 
-use super::support::{ARRIVE, DOMAIN, NODE};
+use super::support::{ARRIVE, DOMAIN, NODE, Pair, redis};
 
-const LINK_DOMAIN: u16 = 50;
 const PAUSE: Duration = Duration::from_millis(200);
 
 /// A `test_msgs/msg/BasicTypes`, and the same in a `Nested`: it has no other field.
@@ -39,62 +36,18 @@ fn basic_types() -> (Vec<u8>, Value) {
     (cdr, json)
 }
 
-/// A robot with ROS 2, and a cloud with Redis alone.
-struct Stage {
-    robot: FlowProcess,
-    cloud: FlowProcess,
-    redis: RedisServer,
-    network: Topology,
-}
-
-impl Stage {
-    fn start() -> anyhow::Result<Self> {
-        let network = Topology::build(&Plan::two_hosts("robot", "cloud", Shape::to_cloud()))?;
-        let (robot, cloud) = (network.host("robot")?, network.host("cloud")?);
-        open_loopback(robot)?;
-        let host = Some(cloud.clone());
-        let redis =
-            RedisServer::start(RedisKind::Redis, RedisOptions { host, ..RedisOptions::default() })?;
-        let on_robot = FlowSpec::new("edge", "robot-1").on_ros2(DOMAIN).joined(LINK_DOMAIN);
-        let in_cloud = FlowSpec::new("cloud", "cloud-1").on_redis(&redis.url(), "");
-        let mut robot = FlowProcess::launch(on_robot.inside(robot, &[cloud.address]))?;
-        let mut cloud = FlowProcess::launch(in_cloud.joined(LINK_DOMAIN).inside(cloud, &[]))?;
-        robot.wait_ready()?;
-        cloud.wait_ready()?;
-        Ok(Self { robot, cloud, redis, network })
-    }
-
-    fn peer(&self, release: Release) -> anyhow::Result<Peer> {
-        let peer = Peer::start(release, self.network.host("robot")?, DOMAIN)?;
-        peer.node(NODE)?;
-        Ok(peer)
-    }
-
-    fn in_cloud<T: Send>(
-        &self,
-        act: impl FnOnce(&str) -> anyhow::Result<T> + Send,
-    ) -> anyhow::Result<T> {
-        let host: &Host = self.network.host("cloud")?;
-        inside(&host.namespace, || act(&self.redis.url()))
-    }
-
-    /// A Redis client of the cloud asks for a topic as JSON.
-    fn read_json(&self, topic: &str) -> anyhow::Result<RedisReader> {
-        let request = json!({
-            "op": "request", "topic": topic, "service": "web", "ttl_s": 0, "json": true,
-            "reliability": "reliable",
-        });
-        self.in_cloud(|url| {
-            let reader = RedisReader::new(url, &format!("blaze/json/{topic}"))?;
-            plain::tell_redis(url, "", &request)?;
-            Ok(reader)
-        })
-    }
-
-    fn state(&self, topic: &str) -> String {
-        let of = |flow: &FlowProcess| format!("{:?}\n{}", flow.why(topic, None), flow.tail());
-        format!("{}\n{}", of(&self.robot), of(&self.cloud))
-    }
+/// A Redis client of the cloud asks for a topic as JSON.
+fn read_json(pair: &Pair<RedisServer>, topic: &str) -> anyhow::Result<RedisReader> {
+    let request = json!({
+        "op": "request", "topic": topic, "service": "web", "ttl_s": 0, "json": true,
+        "reliability": "reliable",
+    });
+    let url = pair.brokers.url();
+    pair.inside("cloud", || {
+        let reader = RedisReader::new(&url, &format!("blaze/json/{topic}"))?;
+        tell_redis(&url, "", &request)?;
+        Ok(reader)
+    })
 }
 
 /// The source of a definition, as a flow says.
@@ -104,7 +57,11 @@ fn source(flow: &FlowProcess, kind: &str) -> anyhow::Result<Value> {
 
 #[test]
 fn what_only_the_talker_knows_is_json_in_the_cloud() -> anyhow::Result<()> {
-    let stage = Stage::start()?;
+    // A robot with ROS 2, and a cloud with Redis alone.
+    let pair = Pair::on(
+        |_, cloud| redis(cloud),
+        |redis, edge, cloud| [edge.on_ros2(DOMAIN), cloud.on_redis(&redis.url(), "")],
+    )?;
     let (cdr, json) = basic_types();
     for (release, topic, kind, expected) in [
         (
@@ -115,22 +72,22 @@ fn what_only_the_talker_knows_is_json_in_the_cloud() -> anyhow::Result<()> {
         ),
         (Release::Kilted, "kilted", "test_msgs/msg/BasicTypes", json),
     ] {
-        let talker = stage.peer(release)?;
+        let talker = pair.on_robot(release)?;
         let publisher = talker.publisher(NODE, topic, kind, Quality::default())?;
-        let mut copies = stage.read_json(topic)?;
+        let mut copies = read_json(&pair, topic)?;
         let began = Instant::now();
         let copy = loop {
             publisher.send(&cdr)?;
             if let Some(copy) = copies.next(PAUSE)? {
                 break copy;
             }
-            anyhow::ensure!(began.elapsed() < ARRIVE, "{topic}: {}", stage.state(topic));
+            anyhow::ensure!(began.elapsed() < ARRIVE, "{topic}: {}", pair.state(topic));
         };
         println!("{release:?}: the first {kind} after {:?}", began.elapsed());
         assert_eq!(serde_json::from_slice::<Value>(&copy)?, expected, "{topic}");
-        assert_eq!(source(&stage.robot, kind)?, "node");
-        assert_eq!(source(&stage.cloud, kind)?, "flow");
-        let network = stage.robot.admin().json("/v1/ros2")?;
+        assert_eq!(source(&pair.edge, kind)?, "node");
+        assert_eq!(source(&pair.cloud, kind)?, "flow");
+        let network = pair.edge.admin().json("/v1/ros2")?;
         let types = network["types"].as_array().context("no types")?;
         let row = types.iter().find(|row| row["type"] == kind);
         assert_eq!(row.context("not among the types")?["source"], "node");

@@ -4,7 +4,7 @@
 use anyhow::Context as _;
 use blaze_tests::ros2::{Quality, Release, Stream};
 
-use super::support::{ARRIVE, NODE, Pair, ends};
+use super::support::{ARRIVE, DEEP, NODE, Pair, ends};
 
 const STATIC: &str = "/tf_static";
 const TRANSFORMS: &str = "tf2_msgs/msg/TFMessage";
@@ -23,16 +23,6 @@ pub(super) const TOPICS: [Topic; 7] = [
     IMAGE,
     ("/large", "sensor_msgs/msg/Image", 6_000_000, 2, 0.5),
 ];
-
-/// Room for all messages at the listener, should it get no processor for a while.
-const DEEP: Quality = Quality {
-    reliable: true,
-    durable: false,
-    depth: 1_000,
-    deadline_ms: 0,
-    lease_ms: 0,
-    lifespan_ms: 0,
-};
 
 /// Some topics from one release to another.
 pub(super) fn carry(

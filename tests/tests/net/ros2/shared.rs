@@ -16,14 +16,7 @@ use super::support::{ARRIVE, DOMAIN, LINK_DOMAIN, MEET, NODE};
 
 const KIND: &str = "std_msgs/msg/String";
 const ROBOTS: [&str; 2] = ["robot-1", "robot-2"];
-const DEEP: Quality = Quality {
-    reliable: true,
-    durable: false,
-    depth: 10_000,
-    deadline_ms: 0,
-    lease_ms: 0,
-    lifespan_ms: 0,
-};
+const DEEP: Quality = Quality { depth: 10_000, ..super::support::DEEP };
 /// For the flow of one robot to take over what that of the other one carried.
 const TAKES_OVER: Duration = Duration::from_secs(5);
 

@@ -1,10 +1,11 @@
-//! A robot and a cloud with a flow each, on the ROS 2 networks of their hosts.
+//! A robot and a cloud with a flow each, on the ROS 2 networks of their hosts or other brokers.
 
 use std::time::Duration;
 
 use blaze_tests::flow::{FlowProcess, FlowSpec};
-use blaze_tests::network::{Host, Plan, Topology};
+use blaze_tests::network::{Host, Plan, Topology, inside};
 use blaze_tests::ros2::{End, Peer, Quality, Release, open_loopback};
+use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
 use blaze_tests::wait;
 use blaze_tests::wan::Shape;
 
@@ -18,31 +19,66 @@ pub(super) const MEET: Duration = Duration::from_secs(20);
 pub(super) const ARRIVE: Duration = Duration::from_secs(30);
 /// The node that each peer has.
 pub(super) const NODE: &str = "peer";
+/// Room for all messages at the listener, should it get no processor for a while.
+pub(super) const DEEP: Quality = Quality {
+    reliable: true,
+    durable: false,
+    depth: 1_000,
+    deadline_ms: 0,
+    lease_ms: 0,
+    lifespan_ms: 0,
+};
 
-/// Two hosts and the link between them; dropped in this order.
-pub(super) struct Pair {
+/// A Redis on a host.
+pub(super) fn redis(host: &Host) -> anyhow::Result<RedisServer> {
+    let options = RedisOptions { host: Some(host.clone()), ..RedisOptions::default() };
+    RedisServer::start(RedisKind::Redis, options)
+}
+
+/// Two hosts, their brokers beside ROS 2, and the link between them; dropped in this order.
+pub(super) struct Pair<B = ()> {
     pub(super) edge: FlowProcess,
     pub(super) cloud: FlowProcess,
-    network: Topology,
+    pub(super) brokers: B,
+    pub(super) network: Topology,
 }
 
 impl Pair {
-    /// Both flows are ready, and have met.
+    /// Both flows are on ROS 2.
     pub(super) fn start() -> anyhow::Result<Self> {
+        Self::on(|_, _| Ok(()), |(), edge, cloud| [edge.on_ros2(DOMAIN), cloud.on_ros2(DOMAIN)])
+    }
+}
+
+impl<B> Pair<B> {
+    /// Starts brokers on both hosts, and lets both flows use them. The flows are ready, and have
+    /// met.
+    pub(super) fn on(
+        brokers: impl FnOnce(&Host, &Host) -> anyhow::Result<B>,
+        flows: impl FnOnce(&B, FlowSpec, FlowSpec) -> [FlowSpec; 2],
+    ) -> anyhow::Result<Self> {
         let network = Topology::build(&Plan::two_hosts("robot", "cloud", Shape::to_cloud()))?;
         let (robot, cloud) = (network.host("robot")?, network.host("cloud")?);
         for host in [robot, cloud] {
             open_loopback(host)?;
         }
-        let flow = |layer, node, host: &Host, peers: &[_]| {
-            let spec = FlowSpec::new(layer, node).on_ros2(DOMAIN).joined(LINK_DOMAIN);
-            FlowProcess::launch(spec.inside(host, peers))
-        };
-        let mut edge = flow("edge", "robot-1", robot, &[cloud.address])?;
-        let mut cloud = flow("cloud", "cloud-1", cloud, &[])?;
+        let brokers = brokers(robot, cloud)?;
+        let spec = |layer, node| FlowSpec::new(layer, node).joined(LINK_DOMAIN);
+        let [edge, there] = flows(&brokers, spec("edge", "robot-1"), spec("cloud", "cloud-1"));
+        let mut edge = FlowProcess::launch(edge.inside(robot, &[cloud.address]))?;
+        let mut cloud = FlowProcess::launch(there.inside(cloud, &[]))?;
         edge.wait_ready()?;
         cloud.wait_ready()?;
-        Ok(Self { edge, cloud, network })
+        Ok(Self { edge, cloud, brokers, network })
+    }
+
+    /// Does something on a host.
+    pub(super) fn inside<T: Send>(
+        &self,
+        host: &str,
+        act: impl FnOnce() -> anyhow::Result<T> + Send,
+    ) -> anyhow::Result<T> {
+        inside(&self.network.host(host)?.namespace, act)
     }
 
     /// A peer with a node beside the flow of the edge.
@@ -82,14 +118,15 @@ impl Pair {
 
     /// What both flows say of a topic.
     pub(super) fn state(&self, topic: &str) -> String {
-        let topic = topic.trim_start_matches('/');
-        let of = |flow: &FlowProcess| {
-            let why =
-                flow.why(topic, None).map_or_else(|error| error.to_string(), |why| why.to_string());
-            format!("{}: {:?} {why}\n{}", flow.spec.layer, flow.bridges_up(), flow.tail())
-        };
-        format!("{}\n{}", of(&self.edge), of(&self.cloud))
+        format!("{}\n{}", state(&self.edge, topic), state(&self.cloud, topic))
     }
+}
+
+/// What a flow says of a topic.
+pub(super) fn state(flow: &FlowProcess, topic: &str) -> String {
+    let why = flow.why(topic.trim_start_matches('/'), None);
+    let why = why.map_or_else(|error| error.to_string(), |why| why.to_string());
+    format!("{}: {:?} {why}\n{}", flow.spec.layer, flow.bridges_up(), flow.tail())
 }
 
 /// A publisher and a subscription of one topic, with a quality for both.

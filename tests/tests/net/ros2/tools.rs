@@ -6,12 +6,11 @@ use blaze_tests::flow::{FlowProcess, FlowSpec};
 use blaze_tests::network::{Plan, Topology};
 use blaze_tests::process::Process;
 use blaze_tests::ros2::{Peer, Quality, Release, Stream, open_loopback};
-use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
 use blaze_tests::wait;
 use blaze_tests::wan::Shape;
 use serde_json::{Value, json};
 
-use super::support::{ARRIVE, DOMAIN, MEET, NODE};
+use super::support::{ARRIVE, DOMAIN, MEET, NODE, redis};
 
 const TWIST: &str = "geometry_msgs/msg/Twist";
 
@@ -20,8 +19,7 @@ fn messages_of_nodes_are_printed_and_json_is_published_for_them() -> anyhow::Res
     let network = Topology::build(&Plan::two_hosts("robot", "other", Shape::default()))?;
     let host = network.host("robot")?;
     open_loopback(host)?;
-    let options = RedisOptions { host: Some(host.clone()), ..RedisOptions::default() };
-    let redis = RedisServer::start(RedisKind::Redis, options)?;
+    let redis = redis(host)?;
     let spec = FlowSpec::new("edge", "robot-1").on_ros2(DOMAIN).on_redis(&redis.url(), "");
     let flow = FlowProcess::start(spec.inside(host, &[]))?;
     let folder = tempfile::tempdir()?;

@@ -1,4 +1,4 @@
-//! Media types of payloads, as far as conversions look at them.
+//! Media types of payloads, as far as flows look at them.
 
 /// What a payload is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
