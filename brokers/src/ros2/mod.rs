@@ -383,10 +383,10 @@ impl Drop for Inner {
 impl Read {
     /// Makes readers for types that writers have now, and ends those of types that none has.
     fn follow(&mut self, inner: &Inner) {
-        let writers = inner.knowledge.endpoints(&self.name, true);
+        let (now, writers) = (Instant::now(), inner.knowledge.endpoints(&self.name, true));
         let is_used = |dds_type: &String| {
             writers.iter().any(|writer| writer.dds_type == *dds_type)
-                || inner.knowledge.is_written(&self.name, dds_type)
+                || inner.knowledge.is_written(now, &self.name, dds_type)
         };
         for unused in self.types.extract_if(.., |dds_type| !is_used(dds_type)) {
             let topic = dds_topic(&self.name, &self.topic, &unused, TimingQos::MARKED);

@@ -24,6 +24,10 @@ const MAX_PARTICIPANTS: usize = 1024;
 const SERVED_AFTER: Duration = Duration::from_millis(20);
 /// An endpoint whose node has not been told counts after this time.
 const NODE_WAIT: Duration = Duration::from_millis(300);
+/// How long a writer of messages is told to the flow after it has left, so that a node that restarts
+/// finds what is bridged for it. Its reader stands for [`LONGEST_DOUBT`] and the second until that is
+/// noticed: as it goes first, no writer meets a reader whose messages go nowhere.
+const LINGERS: Duration = Duration::from_secs(5);
 
 /// The endpoints of one network, those of flows left out.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -45,7 +49,8 @@ struct Entry {
     found: FoundEndpoint,
     endpoint: Arc<RosEndpoint>,
     since: Instant,
-    /// A writer that has left stays for as long as its samples may wait.
+    /// A writer that has left stays for as long as its samples may wait, and those of a writer that
+    /// takes its place.
     gone: Option<Instant>,
 }
 
@@ -229,9 +234,11 @@ impl Knowledge {
     }
 
     /// Whether a topic has a writer of a type, or had one whose samples may still wait.
-    pub(super) fn is_written(&self, name: &RosName, dds_type: &str) -> bool {
+    pub(super) fn is_written(&self, now: Instant, name: &RosName, dds_type: &str) -> bool {
         let of = |it: &RosEndpoint| it.is_writer && it.name == *name && it.dds_type == dds_type;
-        self.state.lock().endpoints.values().any(|entry| of(&entry.endpoint))
+        let waits = |gone: Instant| now.saturating_duration_since(gone) < LONGEST_DOUBT;
+        let state = self.state.lock();
+        state.endpoints.values().any(|it| of(&it.endpoint) && it.gone.is_none_or(waits))
     }
 
     fn publish(&self, state: &mut State, now: Instant) {
@@ -245,14 +252,13 @@ impl Knowledge {
             is_over
         };
         let mut endpoints = Vec::new();
-        for (id, Entry { endpoint, since, gone, .. }) in &state.endpoints {
+        for Entry { endpoint, since, gone, .. } in state.endpoints.values() {
             let counts = endpoint.node.is_some() || is_over(*since + NODE_WAIT);
-            // One that was there for a moment only is named, too: its samples wait for that.
-            let stays = match gone {
-                Some(at) => !state.owned.contains_key(id) && !is_over(*at + LONGEST_DOUBT),
-                None => true,
-            };
-            if counts && stays {
+            let is_told = gone.is_none_or(|gone| {
+                let until = state.told_until(endpoint, gone);
+                until.is_some_and(|until| !is_over(until))
+            });
+            if counts && is_told {
                 endpoints.push(Arc::clone(endpoint));
             }
         }
@@ -282,6 +288,27 @@ fn ids_of(participant: GuidPrefix) -> RangeInclusive<EndpointId> {
 }
 
 impl State {
+    /// Until when a writer that has left is told to the flow, if it still is.
+    fn told_until(&self, writer: &RosEndpoint, gone: Instant) -> Option<Instant> {
+        let lingers = gone + LINGERS;
+        match self.owned.get(&writer.id) {
+            // It is to be named once: its samples wait for that.
+            None => Some(gone + LONGEST_DOUBT),
+            Some(true) if writer.name.carries == Carries::Messages => {
+                let others = self.by_name.get(&writer.name).map_or(&[][..], |it| &it[1]);
+                if others.iter().any(|other| self.owned.get(&other.id) == Some(&true)) {
+                    return None;
+                }
+                // One that nobody has decided about yet may take its place.
+                let undecided = others.iter().filter(|it| !self.owned.contains_key(&it.id));
+                let found = undecided.filter_map(|it| Some(self.endpoints.get(&it.id)?.since));
+                let in_time = found.filter(|since| *since < lingers);
+                in_time.map(|since| since + LONGEST_DOUBT).chain([lingers]).max()
+            }
+            Some(_) => None,
+        }
+    }
+
     /// Takes over what was found: first what is known, so that a crowd displaces nobody. Returns
     /// the names of what came, left or changed.
     fn take_over(&mut self, now: Instant, found: &Endpoints) -> BTreeSet<RosName> {
@@ -292,18 +319,22 @@ impl State {
                 .flat_map(|(all, is_writer)| all.iter().map(move |one| (one.id, (one, is_writer))))
                 .filter(|(_, (one, _))| !one.is_marked())
                 .collect();
+        let is_few = self.endpoints.len() <= 2 * MAX_ENDPOINTS;
         self.endpoints.retain(|id, entry| {
             let is_there = all.contains_key(id);
             if is_there != entry.gone.is_none() {
                 entry.gone = (!is_there).then_some(now);
                 changed.insert(entry.endpoint.name.clone());
             }
-            let waits = |at: Instant| now.saturating_duration_since(at) < LONGEST_DOUBT;
-            let stays = entry.gone.is_none_or(|at| entry.endpoint.is_writer && waits(at));
-            if !stays {
+            let Some(gone) = entry.gone else { return true };
+            let age = now.saturating_duration_since(gone);
+            // Nobody reads it any more.
+            if !entry.endpoint.is_writer || age >= LONGEST_DOUBT {
                 changed.insert(entry.endpoint.name.clone());
             }
-            stays
+            let of_messages = entry.endpoint.name.carries == Carries::Messages;
+            let remembered = if of_messages { LINGERS + LONGEST_DOUBT } else { LONGEST_DOUBT };
+            entry.endpoint.is_writer && age < remembered && is_few
         });
         let mut room = MAX_ENDPOINTS
             .saturating_sub(self.endpoints.values().filter(|entry| entry.gone.is_none()).count());
@@ -376,7 +407,7 @@ mod tests {
         knowledge.tick(now + NODE_WAIT);
         assert_eq!(names(&knowledge), [a, ("/b".to_owned(), None)]);
         // It was found before, so it need not wait again.
-        knowledge.set_owned([(told.id, true)].into());
+        knowledge.set_owned([(told.id, false)].into());
         knowledge.note_endpoints(now + NODE_WAIT, &writers(vec![silent]));
         assert_eq!(names(&knowledge), [("/b".to_owned(), None)]);
     }
@@ -414,7 +445,7 @@ mod tests {
             Admission::Yes,
             "its samples may still come"
         );
-        let later = now + LONGEST_DOUBT;
+        let later = now + LINGERS + LONGEST_DOUBT;
         knowledge.note_endpoints(later, &writers(vec![all[2].clone()]));
         assert_eq!(
             knowledge.admission(&all[0].id, TYPE),
@@ -446,12 +477,61 @@ mod tests {
         assert_eq!(names(&knowledge).len(), 1, "the flow is to decide");
         assert_eq!(knowledge.admission(&brief.id, TYPE), Admission::Later);
         knowledge.set_owned([(brief.id, true)].into());
+        knowledge.tick(now + LINGERS);
         assert!(names(&knowledge).is_empty());
         knowledge.set_owned(HashMap::new());
         assert_eq!(knowledge.admission(&brief.id, TYPE), Admission::Yes);
         assert!(knowledge.writer(&brief.id).is_some());
-        knowledge.note_endpoints(now + LONGEST_DOUBT, &writers(Vec::new()));
+        knowledge.note_endpoints(now + LINGERS + LONGEST_DOUBT, &writers(Vec::new()));
         assert!(knowledge.writer(&brief.id).is_none());
+    }
+
+    #[test]
+    fn a_topic_stays_as_it_is_while_its_node_restarts() {
+        let now = Instant::now();
+        let knowledge = Knowledge::new();
+        let told = |knowledge: &Knowledge| -> Vec<EndpointId> {
+            knowledge.subscribe().borrow().endpoints.iter().map(|it| it.id).collect()
+        };
+        let name = RosName::of_dds("rt/a").unwrap();
+        let [before, after, last] = [1, 2, 3].map(|number| found(number, "rt/a", TYPE));
+        knowledge.note_endpoints(now, &writers(vec![before.clone()]));
+        knowledge.tick(now + NODE_WAIT);
+        knowledge.set_owned([(before.id, true)].into());
+        knowledge.note_endpoints(now, &writers(Vec::new()));
+        let noticed = now + LONGEST_DOUBT;
+        assert!(knowledge.is_written(now, &name, TYPE));
+        assert!(!knowledge.is_written(noticed, &name, TYPE), "its reader goes");
+        let changed = knowledge.note_endpoints(noticed, &writers(Vec::new()));
+        assert_eq!((changed, told(&knowledge)), ([name].into(), vec![before.id]));
+        // The next one is found at the last moment, and decided about later.
+        let back = now + LINGERS.saturating_sub(Duration::from_millis(10));
+        knowledge.note_endpoints(back, &writers(vec![after.clone()]));
+        knowledge.note_endpoints(now + LINGERS, &writers(vec![after.clone()]));
+        assert_eq!(told(&knowledge), [before.id]);
+        knowledge.tick(back + NODE_WAIT);
+        assert_eq!(told(&knowledge), [before.id, after.id]);
+        knowledge.set_owned([(before.id, true), (after.id, true)].into());
+        knowledge.tick(back + NODE_WAIT);
+        assert_eq!(told(&knowledge), [after.id], "it has taken its place");
+        // One that comes too late changes nothing.
+        knowledge.note_endpoints(back, &writers(Vec::new()));
+        knowledge.tick(back + LINGERS);
+        knowledge.note_endpoints(back + LINGERS, &writers(vec![last]));
+        assert!(told(&knowledge).is_empty());
+    }
+
+    #[test]
+    fn a_server_that_ends_is_told_no_longer() {
+        let now = Instant::now();
+        let knowledge = Knowledge::new();
+        let server = found(1, "rr/addReply", TYPE);
+        knowledge.note_endpoints(now, &writers(vec![server.clone()]));
+        knowledge.tick(now + NODE_WAIT);
+        knowledge.set_owned([(server.id, true)].into());
+        assert_eq!(names(&knowledge).len(), 1);
+        knowledge.note_endpoints(now, &writers(Vec::new()));
+        assert!(names(&knowledge).is_empty());
     }
 
     #[test]

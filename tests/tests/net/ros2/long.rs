@@ -26,7 +26,7 @@ fn qualities_of_cyclone_flow_or_are_named() -> anyhow::Result<()> {
 
 #[test]
 fn a_node_restarts_fifty_times() -> anyhow::Result<()> {
-    churn::restart(50)
+    churn::restart(50, true)
 }
 
 #[test]
