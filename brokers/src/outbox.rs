@@ -7,7 +7,7 @@
 //! publisher ─► lane                   ─┘        (what is over its deadline is dropped here)
 //! ```
 //!
-//! A message counts as queued from [`Lane::push`] until it is settled, so that nothing is ever
+//! A message counts as queued from [`Lane::push_unless`] until it is settled, so that nothing is ever
 //! uncounted.
 
 use std::collections::{HashMap, VecDeque};

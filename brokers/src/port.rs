@@ -3,16 +3,19 @@
 //! ```text
 //! publish:    Publisher::publish ──► bounded queue of the adapter ──► server
 //! subscribe:  server ──► adapter ──► SubscriptionSender ──► bounded ring ──► Subscription::receive (batches)
+//!                                                                       └──► or a sink, Subscription::forward
 //! ```
 //!
 //! Publishing never waits: an adapter that cannot keep up drops the oldest of its queue and counts
 //! it. A subscription is a ring that drops its oldest when its reader is slow; the reader learns
 //! how many it missed.
 
+use std::any::Any;
 use std::collections::VecDeque;
 use std::fmt;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use async_trait::async_trait;
@@ -493,36 +496,53 @@ pub trait FlowSide: Send + Sync {
 /// them in time.
 pub type MessageSink = Box<dyn Fn(&mut Vec<Received>, u64) + Send + Sync>;
 
+/// Messages that wait at most for a sink to be called by the thread that brings them. Where more
+/// wait, the reader's task calls it, and the thread goes on reading.
+const AT_ONCE: usize = 64;
+
 struct Ring {
     queue: Mutex<RingState>,
     readable: Notify,
     dropped: AtomicU64,
     options: SubscribeOptions,
-    forward: OnceLock<Forward>,
+    /// Where messages go that no reader asks for. Who holds it calls the sink, so that messages
+    /// stay in order.
+    outflow: Mutex<Option<Outflow>>,
 }
 
-/// Where messages go that nobody waits for.
-struct Forward {
+struct Outflow {
     sink: MessageSink,
     /// Messages that it takes at once.
     limit: usize,
-    /// Who holds it calls the sink, so that messages stay in order.
-    batch: Mutex<Vec<Received>>,
+    batch: Vec<Received>,
+    /// The sink has panicked.
+    panic: Option<Box<dyn Any + Send>>,
 }
 
 impl Ring {
     /// Gives the sink what waits. Where another thread does so, that one takes this, too. Returns
-    /// whether there is a sink.
-    fn forward(&self) -> bool {
-        let Some(forward) = self.forward.get() else { return false };
+    /// whether the reader's task has nothing to do.
+    fn drain(&self) -> bool {
         while !self.queue.lock().messages.is_empty() {
-            let Some(mut batch) = forward.batch.try_lock() else { break };
-            while self.queue.lock().take(&mut batch, forward.limit) > 0 {
-                (forward.sink)(&mut batch, self.dropped.swap(0, Ordering::Relaxed));
-                batch.clear();
-            }
+            let Some(mut outflow) = self.outflow.try_lock() else { break };
+            let Some(outflow) = outflow.as_mut().filter(|it| it.panic.is_none()) else {
+                return false;
+            };
+            outflow.drain(self);
         }
         true
+    }
+}
+
+impl Outflow {
+    fn drain(&mut self, ring: &Ring) {
+        let Self { sink, limit, batch, panic } = self;
+        while panic.is_none() && ring.queue.lock().take(batch, *limit) > 0 {
+            let lost = ring.dropped.swap(0, Ordering::Relaxed);
+            let call = AssertUnwindSafe(|| sink(batch, lost));
+            *panic = catch_unwind(call).err();
+            batch.clear();
+        }
     }
 }
 
@@ -610,7 +630,7 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
         readable: Notify::new(),
         dropped: AtomicU64::new(0),
         options,
-        forward: OnceLock::new(),
+        outflow: Mutex::default(),
     });
     (SubscriptionSender { ring: Arc::clone(&ring) }, Subscription { ring, starts: Vec::new() })
 }
@@ -633,17 +653,23 @@ impl SubscriptionSender {
         self.push([message], false)
     }
 
-    /// Hands over what was put: in this thread, where the reader has a sink. Called without any lock
-    /// that a sink might want.
+    /// Hands over what was put: in this thread, where the reader has a sink and little waits. Called
+    /// without any lock that a sink might want.
     pub(crate) fn flush(&self) {
-        if !self.ring.forward() && !self.ring.queue.lock().messages.is_empty() {
-            self.ring.readable.notify_one();
+        let is_little = self.ring.queue.lock().messages.len() <= AT_ONCE;
+        if !(is_little && self.ring.drain()) {
+            self.wake();
         }
+    }
+
+    /// Lets the reader look at what waits.
+    pub(crate) fn wake(&self) {
+        self.ring.readable.notify_one();
     }
 
     fn hand_over(&self, messages: impl IntoIterator<Item = Received>, raise_bounds: bool) -> bool {
         let lives = self.push(messages, raise_bounds);
-        self.ring.readable.notify_one();
+        self.wake();
         lives
     }
 
@@ -726,13 +752,24 @@ impl Subscription {
     }
 
     /// Gives messages to a sink until the subscription ends, up to `limit` at once. Some adapters
-    /// call it in the thread that reads, so that nobody has to be woken; it must not wait for
-    /// anything, nor drop the subscription. After that is dropped, it is not called any more.
+    /// call it in the thread that reads, so that nobody has to be woken; it must not wait for a
+    /// peer, nor drop the subscription. After that is dropped, it is not called any more.
+    ///
+    /// # Panics
+    /// Where the sink panics, in whichever thread.
     pub async fn forward(&mut self, limit: usize, sink: MessageSink) {
-        let _ = self.ring.forward.set(Forward { sink, limit, batch: Mutex::default() });
+        let outflow = Outflow { sink, limit, batch: Vec::with_capacity(limit), panic: None };
+        *self.ring.outflow.lock() = Some(outflow);
         loop {
-            self.ring.forward();
-            if self.ring.queue.lock().closed {
+            self.ring.drain();
+            let is_closed = self.ring.queue.lock().closed;
+            // Another thread may have taken something, and is waited for before the end.
+            let has_panicked = || self.ring.outflow.lock().as_mut().and_then(|it| it.panic.take());
+            if let Some(panic) = has_panicked() {
+                resume_unwind(panic);
+            }
+            if is_closed {
+                self.ring.drain();
                 return;
             }
             self.ring.readable.notified().await;
@@ -754,10 +791,9 @@ impl Drop for Subscription {
         state.messages.clear();
         state.bytes = 0;
         drop(state);
-        if let Some(forward) = self.ring.forward.get() {
-            // Until then its sink may be called.
-            drop(forward.batch.lock());
-        }
+        // Until its sink has returned, which may be called now.
+        let outflow = self.ring.outflow.lock().take();
+        drop(outflow);
     }
 }
 
@@ -909,5 +945,30 @@ mod tests {
             let of_thread: Vec<u8> = all.iter().copied().filter(|it| it % 2 == offset).collect();
             assert_eq!(of_thread, (0..EACH).filter(|it| it % 2 == offset).collect::<Vec<u8>>());
         }
+    }
+
+    #[test]
+    fn a_panic_of_a_sink_ends_in_the_task_of_the_reader() {
+        let (sender, mut subscription) = bounded(10, usize::MAX);
+        let sink = |batch: &mut Vec<Received>, _| assert!(batch.is_empty(), "as it is meant to");
+        let mut forward = Box::pin(subscription.forward(2, Box::new(sink)));
+        assert!((&mut forward).now_or_never().is_none());
+        sender.put(message(1));
+        sender.flush();
+        assert!(catch_unwind(AssertUnwindSafe(|| forward.now_or_never())).is_err());
+    }
+
+    #[test]
+    fn where_much_waits_the_thread_that_brings_it_goes_on() {
+        let (sender, forward, noted) = forwarding(10_000);
+        let mut forward = Box::pin(forward);
+        assert!((&mut forward).now_or_never().is_none());
+        for number in 0..=AT_ONCE {
+            sender.put(message(number));
+        }
+        sender.flush();
+        assert!(noted.lock().is_empty());
+        assert!((&mut forward).now_or_never().is_none());
+        assert_eq!(noted.lock().iter().map(|(batch, ..)| batch.len()).sum::<usize>(), AT_ONCE + 1);
     }
 }

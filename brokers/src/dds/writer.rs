@@ -67,6 +67,14 @@ enum Begin {
 }
 
 impl Begin {
+    /// There is a new reader. One that waits already goes on as it is, so that readers that come
+    /// one after the other hold nobody up.
+    fn meet(&mut self) {
+        if *self == Self::Done {
+            *self = Self::New;
+        }
+    }
+
     /// Whether a sample may be written. `acknowledged`: all that is written; `wrote`: something is.
     fn allows(&mut self, now: Instant, acknowledged: bool, wrote: bool) -> bool {
         let may = match *self {
@@ -183,7 +191,7 @@ impl Writer {
                 let count = usize::try_from(current.count()).unwrap_or(0);
                 self.matched.store(count, Ordering::Relaxed);
                 if current.count_change() > 0 && endpoint_of(reader).starts_with(&CYCLONE) {
-                    *self.begin.lock() = Begin::New;
+                    self.begin.lock().meet();
                 }
             }
         }
@@ -191,7 +199,7 @@ impl Writer {
             // Others may have been lost. A sample without a reader costs nothing, a reader without
             // its samples does.
             self.matched.fetch_max(STATUS_EVENTS, Ordering::Relaxed);
-            *self.begin.lock() = Begin::New;
+            self.begin.lock().meet();
         }
         self.matched.load(Ordering::Relaxed)
     }

@@ -328,13 +328,14 @@ impl State {
             }
             let Some(gone) = entry.gone else { return true };
             let age = now.saturating_duration_since(gone);
-            // Nobody reads it any more.
-            if !entry.endpoint.is_writer || age >= LONGEST_DOUBT {
-                changed.insert(entry.endpoint.name.clone());
-            }
             let of_messages = entry.endpoint.name.carries == Carries::Messages;
             let remembered = if of_messages { LINGERS + LONGEST_DOUBT } else { LONGEST_DOUBT };
-            entry.endpoint.is_writer && age < remembered && is_few
+            let stays = entry.endpoint.is_writer && age < remembered && is_few;
+            // Nobody reads it any more.
+            if !stays || age >= LONGEST_DOUBT {
+                changed.insert(entry.endpoint.name.clone());
+            }
+            stays
         });
         let mut room = MAX_ENDPOINTS
             .saturating_sub(self.endpoints.values().filter(|entry| entry.gone.is_none()).count());

@@ -203,7 +203,9 @@ impl InterScope {
         // Others may still hold it for the datagram that they send. Its end takes a while, and is
         // not to come in a thread of the transport.
         let gone = self.transport.lock().take();
-        while gone.as_ref().is_some_and(|gone| Arc::strong_count(gone) > 1) {
+        let until = Instant::now() + DRAIN;
+        let is_held = || gone.as_ref().is_some_and(|gone| Arc::strong_count(gone) > 1);
+        while is_held() && Instant::now() < until {
             std::thread::sleep(LOOK);
         }
         drop(gone);

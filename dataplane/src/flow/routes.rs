@@ -212,7 +212,7 @@ impl Routes {
         let scope = bridge.to.scope();
         let broker = match self.brokers.of(scope) {
             Some(broker) => broker,
-            // Replies to calls are taken out before: what still comes is too late for everybody.
+            // Replies to calls are taken out before.
             None if scope == Scope::Node => {
                 return Ok(NewWriter { publisher: Arc::new(Nowhere), options });
             }

@@ -13,7 +13,7 @@ use std::num::NonZeroUsize;
 use std::time::Instant;
 
 use blaze_brokers::{Content, Received};
-use blaze_domain::{Scope, WriterId};
+use blaze_domain::{DropReason, Scope, WriterId};
 use blaze_proto::Frame;
 use lru::LruCache;
 
@@ -76,10 +76,13 @@ impl Calls {
     }
 }
 
-fn keep<T>(waiting: &mut Vec<T>, one: T) {
-    if waiting.len() < MAX_WAITING {
+/// Returns whether there is room.
+fn keep<T>(waiting: &mut Vec<T>, one: T) -> bool {
+    let has_room = waiting.len() < MAX_WAITING;
+    if has_room {
         waiting.push(one);
     }
+    has_room
 }
 
 impl DataCore {
@@ -127,15 +130,19 @@ impl DataCore {
         let frame = &message.frame;
         let Some(request) = frame.related() else { return false };
         let is_cdr = matches!(Media::of(frame.encoding()), Media::Cdr { .. });
-        if from == Scope::Ros2 && is_cdr && self.calls.served.pop(&request).is_some() {
-            keep(&mut self.calls.answers, CallAnswer::Reply(frame.clone()));
-            return true;
-        }
         let is_answer = matches!(frame.encoding(), CALL_REPLY | CALL_FAULT)
             && self.config.me.is_written(frame.to());
-        if is_answer {
-            keep(&mut self.calls.arrived, frame.clone());
+        let has_room = if from == Scope::Ros2 && is_cdr && self.calls.served.pop(&request).is_some()
+        {
+            keep(&mut self.calls.answers, CallAnswer::Reply(frame.clone()))
+        } else if is_answer {
+            keep(&mut self.calls.arrived, frame.clone())
+        } else {
+            return false;
+        };
+        if !has_room {
+            self.unattributed.add(DropReason::QueueFull, 1);
         }
-        is_answer
+        true
     }
 }

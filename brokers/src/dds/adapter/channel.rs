@@ -366,6 +366,8 @@ impl Channels {
         for channel in by_topic.get(&topic.name).into_iter().flatten() {
             if channel.topic == *topic {
                 channel.senders.lock().retain(|other| !other.is_same(sender));
+                // It may have been given something just now.
+                sender.wake();
             }
         }
     }

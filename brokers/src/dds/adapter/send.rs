@@ -161,7 +161,7 @@ pub(super) fn start(shared: &Arc<Shared>) -> Result<StoppableThread, DdsError> {
 /// is left to the sender's thread.
 pub(super) fn write_at_once(shared: &Shared) -> bool {
     let Some(mut sender) = shared.sender.try_lock() else { return false };
-    if !sender.has_room(Instant::now()) {
+    if !sender.has_room(Instant::now()) || shared.stop.load(Ordering::Acquire) {
         return false;
     }
     sender.turn(shared, true);
@@ -197,21 +197,30 @@ impl Sender {
 
     /// Whether a publisher may write itself: nothing waits, and little was written lately.
     fn has_room(&self, now: Instant) -> bool {
-        let is_over = |pause| now.saturating_duration_since(self.since) >= pause;
-        self.held.is_empty() && self.pause().is_none_or(is_over)
+        self.held.is_empty() && self.pause(now).is_zero()
     }
 
-    /// How long what was written takes at least, if it was much.
-    fn pause(&self) -> Option<Duration> {
+    /// What was written takes so much time at least.
+    fn takes(&self) -> Duration {
+        let turns = self.bytes.div_ceil(TURN_BYTES).max(self.messages.div_ceil(TURN_MESSAGES));
+        TURN * u32::try_from(turns).unwrap_or(u32::MAX)
+    }
+
+    /// How long nothing is written, since much was.
+    fn pause(&self, now: Instant) -> Duration {
         let is_much = self.messages >= TURN_MESSAGES / 2 || self.bytes >= TURN_BYTES / 2;
-        let turns = u32::try_from(self.bytes.div_ceil(TURN_BYTES)).unwrap_or(u32::MAX).max(1);
-        is_much.then(|| TURN * turns)
+        let passed = now.saturating_duration_since(self.since);
+        if is_much { self.takes().saturating_sub(passed) } else { Duration::ZERO }
     }
 
     /// Writes what it holds, and what waits, as far as that goes now; `at_once`: only a little.
     fn turn(&mut self, shared: &Shared, at_once: bool) -> Rest {
         let begin = Instant::now();
-        if begin.saturating_duration_since(self.since) >= self.pause().unwrap_or(TURN) {
+        let pause = self.pause(begin);
+        if !pause.is_zero() {
+            return Rest::Pause(pause);
+        }
+        if begin.saturating_duration_since(self.since) >= self.takes().max(TURN) {
             (self.since, self.messages, self.bytes) = (begin, 0, 0);
         }
         let retried = self.retry(shared, begin);
@@ -240,14 +249,7 @@ impl Sender {
         shared.held.store(self.held.values().map(VecDeque::len).sum(), Ordering::Release);
         self.messages += count + retried;
         self.bytes += bytes.max(of_large * LARGE_COST);
-        match self.pause() {
-            Some(pause) => {
-                let rest = pause.saturating_sub(self.since.elapsed());
-                if rest.is_zero() { Rest::None } else { Rest::Pause(rest) }
-            }
-            None if count == 0 => Rest::Filled(self.longest_wait()),
-            None => Rest::None,
-        }
+        if count + retried == 0 { Rest::Filled(self.longest_wait()) } else { Rest::None }
     }
 
     /// How long it waits for something to do.
@@ -335,6 +337,8 @@ mod tests {
         assert!(sender.has_room(now));
         sender.messages = TURN_MESSAGES / 2;
         assert!(!sender.has_room(now) && sender.has_room(now + TURN));
+        sender.messages = TURN_MESSAGES + 1;
+        assert!(!sender.has_room(now + TURN) && sender.has_room(now + 2 * TURN));
         (sender.messages, sender.bytes) = (1, 3 * TURN_BYTES);
         assert!(!sender.has_room(now + 2 * TURN) && sender.has_room(now + 3 * TURN));
         sender.bytes = TURN_BYTES / 2 - 1;
