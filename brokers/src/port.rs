@@ -525,10 +525,11 @@ impl Ring {
     fn drain(&self) -> bool {
         while !self.queue.lock().messages.is_empty() {
             let Some(mut outflow) = self.outflow.try_lock() else { break };
-            let Some(outflow) = outflow.as_mut().filter(|it| it.panic.is_none()) else {
-                return false;
-            };
+            let Some(outflow) = &mut *outflow else { return false };
             outflow.drain(self);
+            if outflow.panic.is_some() {
+                return false;
+            }
         }
         true
     }
