@@ -26,11 +26,6 @@ use blaze_runtime::supervisor::{
 use blaze_runtime::{environment, logs, ready_line, state};
 use clap::Parser;
 
-/// Messages are made on one thread and dropped on another. The allocator of glibc gives memory of
-/// large ones back to the kernel each time.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 const NAME: &str = "blaze-flow";
 /// A shutdown takes at most this long.
 const SHUTDOWN: Duration = Duration::from_secs(5);
