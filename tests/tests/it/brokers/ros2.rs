@@ -85,9 +85,12 @@ impl Net {
 }
 
 fn put(writer: &Writer, number: u8) {
-    let written =
-        writer.write_cdr(Cdr::little(cdr(number).into()).unwrap(), WriteOptionsBuilder::new());
+    let written = write(writer, number);
     assert!(matches!(written, Written::Taken(_)), "{written:?}");
+}
+
+fn write(writer: &Writer, number: u8) -> Written {
+    writer.write_cdr(Cdr::little(cdr(number).into()).unwrap(), WriteOptionsBuilder::new())
 }
 
 fn frame(topic: &str, writer: u8, number: u8) -> Frame {
@@ -113,12 +116,14 @@ async fn meet(writer: &Writer, subscription: &mut Subscription) {
     let meet = async {
         let (mut found, pause) = (Vec::new(), Duration::from_millis(50));
         while found.is_empty() {
-            put(writer, GREETING);
+            // Without a reader, or with a full window, it is tried again.
+            write(writer, GREETING);
             let received = subscription.receive(&mut found, usize::MAX);
             let _ = tokio::time::timeout(pause, received).await;
         }
     };
     assert!(tokio::time::timeout(DEADLINE, meet).await.is_ok(), "they have not met");
+    eventually("acknowledged", || writer.is_acknowledged().then_some(())).await;
 }
 
 /// Reads until a message with this number came.
@@ -146,10 +151,11 @@ async fn what_the_flow_writes_leaves_room_for_samples_that_wait_for_an_owner() {
     let publisher = net.broker.publisher(&"a".parse().unwrap(), RELIABLE).unwrap();
     let waits = || (net.broker.counts().undecided_bytes > 0).then_some(());
     eventually("a sample waits", || {
-        put(&writer, GREETING);
+        write(&writer, GREETING);
         waits()
     })
     .await;
+    eventually("acknowledged", || writer.is_acknowledged().then_some(())).await;
     put(&writer, 1);
     for _ in 0..3_000 {
         publisher.publish(&frame("a", 7, 9), None);
