@@ -104,7 +104,7 @@ impl Routes {
         let now = Instant::now();
         let held = self.plane.read(|state| {
             state.core.find(topic.as_str())?;
-            let large = state.core.is_large(topic, info.max_bytes);
+            let large = state.core.is_large(topic, &info);
             let writers: Vec<Option<NewWriter>> = plan
                 .bridges
                 .iter()
@@ -117,7 +117,7 @@ impl Routes {
             return None;
         }
         let (large, held) = held.unwrap_or_else(|| {
-            let large = self.plane.read(|state| state.core.is_large(topic, info.max_bytes));
+            let large = self.plane.read(|state| state.core.is_large(topic, &info));
             (large, vec![None; plan.bridges.len()])
         });
         // Made before the lock is taken, because making one takes time.

@@ -28,7 +28,7 @@ use super::compress_stage::{Arrival, CompressStage, ToBrokers, ToLanes};
 use super::early::Early;
 use super::kept::KeptMessages;
 use super::measure::micros;
-use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
+use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
 use super::places::topic_id;
 use super::reading::For;
 use super::stats::Drops;
@@ -37,7 +37,7 @@ use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
 use crate::link::{Engine, LaneId, PeerState, Submit};
 use crate::plan::Target;
-use crate::types::{ConvertFailure, Encoding, Types};
+use crate::types::{ConvertFailure, Encoding, MessageType, Types};
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
 pub const MAX_WRITERS: usize = 65_536;
@@ -231,11 +231,14 @@ impl DataCore {
         &mut self.topics[topic.0 as usize]
     }
 
-    /// Whether a topic is large, as advertised or as seen.
+    /// Whether brokers are to make room for large messages of a topic: as advertised, as seen, or
+    /// as its type lets expect.
     #[must_use]
-    pub fn is_large(&self, topic: &TopicName, advertised: Option<u64>) -> bool {
+    pub fn is_large(&self, topic: &TopicName, info: &TopicInfo) -> bool {
         let seen = self.find(topic.as_str()).map_or(0, |id| self.path(id).largest_bytes);
-        seen.max(advertised.unwrap_or(0)) > self.config.large_bytes
+        let published = info.types.published.as_ref();
+        seen.max(info.max_bytes.unwrap_or(0)) > self.config.large_bytes
+            || published.is_some_and(MessageType::is_large)
     }
 
     /// The writer that a bridge to a local broker has, or had and has not emptied yet.

@@ -48,7 +48,27 @@ pub struct MessageType<T = String> {
     pub hash: T,
 }
 
+/// Types of sensor data whose messages are mostly large. RustDDS keeps so many samples of a topic
+/// as its first reader had room for, and never fewer: where only the first image told that it is
+/// large, a thousand images stayed in memory.
+const LARGE_TYPES: [&str; 8] = [
+    "grid_map_msgs/msg/GridMap",
+    "nav_msgs/msg/OccupancyGrid",
+    "octomap_msgs/msg/Octomap",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/PointCloud",
+    "sensor_msgs/msg/PointCloud2",
+    "stereo_msgs/msg/DisparityImage",
+];
+
 impl MessageType {
+    /// Whether large messages are to be expected, before one has come.
+    #[must_use]
+    pub fn is_large(&self) -> bool {
+        LARGE_TYPES.contains(&self.name.as_str())
+    }
+
     /// The same, borrowed.
     #[must_use]
     pub fn borrowed(&self) -> MessageType<&str> {

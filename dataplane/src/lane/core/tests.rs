@@ -23,6 +23,7 @@ use super::*;
 use crate::lane::path::{BareInfo, TopicInfo};
 use crate::plan::{Bridge, Form, LaneSpec, TopicPlan};
 use crate::testing::access;
+use crate::types::TopicTypes;
 use crate::world::LayerScopeId;
 
 #[derive(Default)]
@@ -429,6 +430,26 @@ fn the_class_falls_when_a_large_message_comes_and_only_after_the_old_class_has_d
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 3, "robot-1", 0, 10))]);
     let classes: Vec<_> = bench.link.submitted.iter().map(|(_, class, _)| *class).collect();
     assert_eq!(classes, [Priority::State, Priority::State, Priority::Bulk]);
+}
+
+#[test]
+fn brokers_make_room_for_large_messages_before_one_has_come() {
+    let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);
+    let topic: TopicName = "imu/data".parse().unwrap();
+    let published = |name: &str| {
+        let published = Some(MessageType { name: name.into(), hash: String::new() });
+        TopicInfo {
+            types: TopicTypes { published, ..TopicTypes::default() },
+            ..TopicInfo::default()
+        }
+    };
+    let advertised = TopicInfo { max_bytes: Some(70_000), ..TopicInfo::default() };
+    let is_large = |bench: &Bench, info| bench.core.is_large(&topic, &info);
+    assert!(is_large(&bench, published("sensor_msgs/msg/Image")));
+    assert!(is_large(&bench, advertised));
+    assert!(!is_large(&bench, published("sensor_msgs/msg/Imu")));
+    bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 70_000))]);
+    assert!(is_large(&bench, TopicInfo::default()), "one has come");
 }
 
 #[test]
