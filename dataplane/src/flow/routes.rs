@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Begin, Broker, BrokerError, Later, PublishOutcome, Publisher, PublisherOptions, Received,
-    SubscribeOptions,
+    Begin, Broker, BrokerError, BrokerKind, Later, PublishOutcome, Publisher, PublisherOptions,
+    Received, SubscribeOptions,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName};
@@ -238,9 +238,15 @@ impl Routes {
             }
             return;
         }
+        let Some(broker) = self.brokers.of(scope) else { return };
+        let makes_room = !matches!(broker.kind(), BrokerKind::Dds | BrokerKind::Ros2);
         let before = match held {
-            // Who has begun with what was kept has it.
-            Some(source) if source.large == large && (source.with_kept || !with_kept) && !anew => {
+            // Who has begun with what was kept has it. DDS makes no other room than at first.
+            Some(source)
+                if (source.large == large || !makes_room)
+                    && (source.with_kept || !with_kept)
+                    && !anew =>
+            {
                 sources.insert((id, scope), source);
                 return;
             }
@@ -258,7 +264,6 @@ impl Routes {
             }
             None => None,
         };
-        let Some(broker) = self.brokers.of(scope) else { return };
         let state = Arc::<Mutex<SourceState>>::default();
         let source = SourceTask {
             plane: Arc::clone(&self.plane),

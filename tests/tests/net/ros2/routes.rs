@@ -13,6 +13,8 @@ const TRANSFORMS: &str = "tf2_msgs/msg/TFMessage";
 type Topic = (&'static str, &'static str, usize, usize, f64);
 
 const TEXT: Topic = ("/text", "std_msgs/msg/String", 101, 50, 50.0);
+/// Its type does not tell that its messages are large, the first one does.
+const LONG_TEXT: Topic = ("/long_text", "std_msgs/msg/String", 70_000, 150, 100.0);
 const IMAGE: Topic = ("/image", "sensor_msgs/msg/Image", 1_000_000, 5, 2.0);
 pub(super) const TOPICS: [Topic; 7] = [
     TEXT,
@@ -55,7 +57,7 @@ fn messages_arrive_in_the_cloud_as_they_were_published() -> anyhow::Result<()> {
     for (from, to) in [(FastDds, Kilted), (Jazzy, FastDds)] {
         carry(&pair, from, to, &[TEXT, IMAGE])?;
     }
-    Ok(())
+    carry(&pair, Jazzy, Kilted, &[LONG_TEXT])
 }
 
 #[test]
