@@ -22,26 +22,27 @@ use crate::port::{Received, SubscribeOptions};
 /// them in time.
 pub type MessageSink = Box<dyn Fn(&mut Vec<Received>, u64) + Send + Sync>;
 
-/// Messages that wait at most for a sink to be called by the thread that brings them. Where more
-/// wait, the reader's task calls it, and the thread goes on reading.
-const AT_ONCE: usize = 64;
+/// Most waiting messages with which the sending thread calls the sink itself. Where more wait, the
+/// reader's task calls it, and the sending thread goes on reading from the server.
+const MAX_INLINE: usize = 64;
 
 struct Ring {
     queue: Mutex<RingState>,
     readable: Notify,
     dropped: AtomicU64,
     options: SubscribeOptions,
-    /// Where messages go that no reader asks for. Who holds it calls the sink, so that messages
+    /// Of a reader with a sink. Only the thread that holds the lock calls the sink, so that messages
     /// stay in order.
-    outflow: Mutex<Option<Outflow>>,
+    forwarder: Mutex<Option<Forwarder>>,
 }
 
-struct Outflow {
+/// Calls the sink of [`Subscription::forward`].
+struct Forwarder {
     sink: MessageSink,
-    /// Messages that it takes at once.
+    /// Most messages per call.
     limit: usize,
     batch: Vec<Received>,
-    /// The sink has panicked.
+    /// Panic of the sink, which goes on in the reader's task.
     panic: Option<Box<dyn Any + Send>>,
 }
 
@@ -50,10 +51,10 @@ impl Ring {
     /// whether the reader's task has nothing to do.
     fn drain(&self) -> bool {
         while !self.queue.lock().messages.is_empty() {
-            let Some(mut outflow) = self.outflow.try_lock() else { break };
-            let Some(outflow) = &mut *outflow else { return false };
-            outflow.drain(self);
-            if outflow.panic.is_some() {
+            let Some(mut forwarder) = self.forwarder.try_lock() else { break };
+            let Some(forwarder) = &mut *forwarder else { return false };
+            forwarder.drain(self);
+            if forwarder.panic.is_some() {
                 return false;
             }
         }
@@ -61,7 +62,7 @@ impl Ring {
     }
 }
 
-impl Outflow {
+impl Forwarder {
     fn drain(&mut self, ring: &Ring) {
         let Self { sink, limit, batch, panic } = self;
         while panic.is_none() && ring.queue.lock().take(batch, *limit) > 0 {
@@ -157,7 +158,7 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
         readable: Notify::new(),
         dropped: AtomicU64::new(0),
         options,
-        outflow: Mutex::default(),
+        forwarder: Mutex::default(),
     });
     (SubscriptionSender { ring: Arc::clone(&ring) }, Subscription { ring, starts: Vec::new() })
 }
@@ -183,7 +184,7 @@ impl SubscriptionSender {
     /// Hands over what was put: in this thread, where the reader has a sink and little waits. Called
     /// without any lock that a sink might want.
     pub(crate) fn flush(&self) {
-        let is_little = self.ring.queue.lock().messages.len() <= AT_ONCE;
+        let is_little = self.ring.queue.lock().messages.len() <= MAX_INLINE;
         if !(is_little && self.ring.drain()) {
             self.wake();
         }
@@ -285,14 +286,14 @@ impl Subscription {
     /// # Panics
     /// Where the sink panics, in whichever thread.
     pub async fn forward(&mut self, limit: usize, sink: MessageSink) {
-        let outflow = Outflow { sink, limit, batch: Vec::with_capacity(limit), panic: None };
-        *self.ring.outflow.lock() = Some(outflow);
+        let forwarder = Forwarder { sink, limit, batch: Vec::with_capacity(limit), panic: None };
+        *self.ring.forwarder.lock() = Some(forwarder);
         loop {
             self.ring.drain();
             let is_closed = self.ring.queue.lock().closed;
             // Another thread may have taken something, and is waited for before the end.
-            let has_panicked = || self.ring.outflow.lock().as_mut().and_then(|it| it.panic.take());
-            if let Some(panic) = has_panicked() {
+            let panic = self.ring.forwarder.lock().as_mut().and_then(|it| it.panic.take());
+            if let Some(panic) = panic {
                 resume_unwind(panic);
             }
             if is_closed {
@@ -319,8 +320,8 @@ impl Drop for Subscription {
         state.bytes = 0;
         drop(state);
         // Until its sink has returned, which may be called now.
-        let outflow = self.ring.outflow.lock().take();
-        drop(outflow);
+        let forwarder = self.ring.forwarder.lock().take();
+        drop(forwarder);
     }
 }
 
@@ -493,12 +494,13 @@ mod tests {
         let (sender, forward, noted) = forwarding(10_000);
         let mut forward = Box::pin(forward);
         assert!((&mut forward).now_or_never().is_none());
-        for number in 0..=AT_ONCE {
+        for number in 0..=MAX_INLINE {
             sender.put(message(number));
         }
         sender.flush();
         assert!(noted.lock().is_empty());
         assert!((&mut forward).now_or_never().is_none());
-        assert_eq!(noted.lock().iter().map(|(batch, ..)| batch.len()).sum::<usize>(), AT_ONCE + 1);
+        let count = noted.lock().iter().map(|(batch, ..)| batch.len()).sum::<usize>();
+        assert_eq!(count, MAX_INLINE + 1);
     }
 }
