@@ -16,6 +16,7 @@ pub mod port;
 pub mod redis;
 pub mod retained;
 pub mod ros2;
+mod subscription;
 mod wake;
 mod worker_side;
 

@@ -403,19 +403,19 @@ impl<C> Outbox<C> {
 }
 
 impl<C> Lane<C> {
-    /// Queues a message, and tells whoever takes.
+    /// Queues a message and wakes the writer of the connection.
     #[cfg(test)]
     pub(crate) fn push(&self, body: Body, deadline: Option<Instant>) -> PublishOutcome {
         self.push_unless(body, deadline, || false)
     }
 
-    /// Queues a message; the oldest of the lane give way. Whoever takes is told if nothing of the
-    /// lane waited, unless `is_seen_to` sees to it at once.
+    /// Queues a message; the oldest of the lane give way. If nothing of the lane waited, the writer
+    /// of the connection is woken, unless `write_at_once` has left nothing to it.
     pub(crate) fn push_unless(
         &self,
         body: Body,
         deadline: Option<Instant>,
-        is_seen_to: impl FnOnce() -> bool,
+        write_at_once: impl FnOnce() -> bool,
     ) -> PublishOutcome {
         let since = Instant::now();
         let longest = self.longest_wait.map(|wait| (since + wait, DropReason::BrokerError));
@@ -456,7 +456,7 @@ impl<C> Lane<C> {
             }
             state.turns.push_back(self.id);
         }
-        if !is_seen_to() {
+        if !write_at_once() {
             self.outbox.filled.notify_one();
         }
         PublishOutcome::Taken
@@ -485,8 +485,8 @@ pub(crate) trait Admission: Send + Sync {
     /// A message has been queued; it may have been shut meanwhile.
     fn queued(&self) {}
 
-    /// Takes what is queued in this thread. Returns whether nobody else has to.
-    fn takes_at_once(&self) -> bool {
+    /// Writes in this thread what is queued. Returns whether nothing is left to another.
+    fn write_at_once(&self) -> bool {
         false
     }
 
@@ -510,7 +510,7 @@ impl<C, A: Admission> LanePublisher<C, A> {
         if payload_bytes > MAX_PAYLOAD_BYTES {
             return PublishOutcome::TooLarge;
         }
-        let outcome = self.lane.push_unless(body, deadline, || self.admission.takes_at_once());
+        let outcome = self.lane.push_unless(body, deadline, || self.admission.write_at_once());
         self.admission.queued();
         outcome
     }

@@ -24,7 +24,7 @@ const MAX_PARTICIPANTS: usize = 1024;
 const SERVED_AFTER: Duration = Duration::from_millis(20);
 /// An endpoint whose node has not been told counts after this time.
 const NODE_WAIT: Duration = Duration::from_millis(300);
-/// How long a writer of messages is told to the flow after it has left, so that a node that restarts
+/// How long a writer of messages stays listed after it has left, so that a node that restarts
 /// finds what is bridged for it. Its reader stands for [`LONGEST_DOUBT`] and the second until that is
 /// noticed: as it goes first, no writer meets a reader whose messages go nowhere.
 const LINGERS: Duration = Duration::from_secs(5);
@@ -254,11 +254,11 @@ impl Knowledge {
         let mut endpoints = Vec::new();
         for Entry { endpoint, since, gone, .. } in state.endpoints.values() {
             let counts = endpoint.node.is_some() || is_over(*since + NODE_WAIT);
-            let is_told = gone.is_none_or(|gone| {
-                let until = state.told_until(endpoint, gone);
+            let is_listed = gone.is_none_or(|gone| {
+                let until = state.listed_until(endpoint, gone);
                 until.is_some_and(|until| !is_over(until))
             });
-            if counts && is_told {
+            if counts && is_listed {
                 endpoints.push(Arc::clone(endpoint));
             }
         }
@@ -288,8 +288,8 @@ fn ids_of(participant: GuidPrefix) -> RangeInclusive<EndpointId> {
 }
 
 impl State {
-    /// Until when a writer that has left is told to the flow, if it still is.
-    fn told_until(&self, writer: &RosEndpoint, gone: Instant) -> Option<Instant> {
+    /// Until when a writer that has left stays in [`Network::endpoints`], if it still does.
+    fn listed_until(&self, writer: &RosEndpoint, gone: Instant) -> Option<Instant> {
         let lingers = gone + LINGERS;
         match self.owned.get(&writer.id) {
             // It is to be named once: its samples wait for that.
@@ -491,7 +491,7 @@ mod tests {
     fn a_topic_stays_as_it_is_while_its_node_restarts() {
         let now = Instant::now();
         let knowledge = Knowledge::new();
-        let told = |knowledge: &Knowledge| -> Vec<EndpointId> {
+        let listed = |knowledge: &Knowledge| -> Vec<EndpointId> {
             knowledge.subscribe().borrow().endpoints.iter().map(|it| it.id).collect()
         };
         let name = RosName::of_dds("rt/a").unwrap();
@@ -504,26 +504,26 @@ mod tests {
         assert!(knowledge.is_written(now, &name, TYPE));
         assert!(!knowledge.is_written(noticed, &name, TYPE), "its reader goes");
         let changed = knowledge.note_endpoints(noticed, &writers(Vec::new()));
-        assert_eq!((changed, told(&knowledge)), ([name].into(), vec![before.id]));
+        assert_eq!((changed, listed(&knowledge)), ([name].into(), vec![before.id]));
         // The next one is found at the last moment, and decided about later.
         let back = now + LINGERS.saturating_sub(Duration::from_millis(10));
         knowledge.note_endpoints(back, &writers(vec![after.clone()]));
         knowledge.note_endpoints(now + LINGERS, &writers(vec![after.clone()]));
-        assert_eq!(told(&knowledge), [before.id]);
+        assert_eq!(listed(&knowledge), [before.id]);
         knowledge.tick(back + NODE_WAIT);
-        assert_eq!(told(&knowledge), [before.id, after.id]);
+        assert_eq!(listed(&knowledge), [before.id, after.id]);
         knowledge.set_owned([(before.id, true), (after.id, true)].into());
         knowledge.tick(back + NODE_WAIT);
-        assert_eq!(told(&knowledge), [after.id], "it has taken its place");
+        assert_eq!(listed(&knowledge), [after.id], "it has taken its place");
         // One that comes too late changes nothing.
         knowledge.note_endpoints(back, &writers(Vec::new()));
         knowledge.tick(back + LINGERS);
         knowledge.note_endpoints(back + LINGERS, &writers(vec![last]));
-        assert!(told(&knowledge).is_empty());
+        assert!(listed(&knowledge).is_empty());
     }
 
     #[test]
-    fn a_server_that_ends_is_told_no_longer() {
+    fn a_server_that_ends_is_listed_no_longer() {
         let now = Instant::now();
         let knowledge = Knowledge::new();
         let server = found(1, "rr/addReply", TYPE);

@@ -15,6 +15,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::control::{
     Answer, CallMessage, Common, ControlError, ErrorCode, LeaseKind, MAX_CALL_TIMEOUT_MS,
 };
+use blaze_domain::media::{CALL, CALL_FAULT};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, Origin, Scope, ServiceName, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
@@ -28,7 +29,6 @@ use crate::plan::network::{Servers, servers};
 use crate::plan::{Survey, Target};
 use crate::registry::{CallIn, CalledTopics};
 use crate::world::FlowState;
-use blaze_domain::media::{CALL, CALL_FAULT};
 
 /// Calls of a flow that wait for their replies.
 const MAX_PENDING: usize = 256;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use blaze_domain::control::{ControlError, ErrorCode};
+use blaze_domain::media::{CALL_FAULT, CALL_REPLY, Media};
 use blaze_domain::{Origin, TopicName, WhyCode, WriterId};
 use blaze_proto::{Frame, Header};
 use tokio_util::sync::CancellationToken;
@@ -13,7 +14,6 @@ use super::Shared;
 use super::plane::wall_ns;
 use crate::lane::calls::CallAnswer;
 use crate::types::{ConvertFailure, Encoding, MessageType, Types};
-use blaze_domain::media::{CALL_FAULT, CALL_REPLY, Media};
 
 /// Answers calls until the flow ends.
 pub(super) async fn answer_calls(shared: Arc<Shared>, stop: CancellationToken) {

@@ -13,6 +13,7 @@ use std::num::NonZeroUsize;
 use std::time::Instant;
 
 use blaze_brokers::{Content, Received};
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY, Media};
 use blaze_domain::{DropReason, Scope, WriterId};
 use blaze_proto::Frame;
 use lru::LruCache;
@@ -20,7 +21,6 @@ use lru::LruCache;
 use super::admit::Admitted;
 use super::core::{DataCore, LaneLink};
 use crate::types::ConvertFailure;
-use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY, Media};
 
 /// Calls that own servers have not answered; the oldest are given up.
 const MAX_SERVED: usize = 4_096;

@@ -8,12 +8,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use blaze_domain::control::LeaseKind;
+use blaze_domain::media::JSON;
 use blaze_domain::{Durability, FlowId, Reliability, ServiceName, TopicName};
 
 use super::Registry;
 use crate::plan::told::{merge_offers, merge_requests};
 use crate::world::{Advertise, Request, ScopeEntry, Source};
-use blaze_domain::media::JSON;
 
 /// Callers by topic of requests or replies.
 #[derive(Default)]

@@ -59,7 +59,8 @@ pub(super) struct Channel {
     /// It stands in the list of those with samples.
     is_ready: AtomicBool,
     ready: Arc<Ready>,
-    weak: Weak<Self>,
+    /// Of its readers.
+    waker: Waker,
 }
 
 /// Channels with samples, and the thread that empties them.
@@ -95,7 +96,7 @@ impl Channel {
     }
 
     /// It is read now: whoever waits for that is told, and what came meanwhile is looked for.
-    pub(super) fn opened(&self) {
+    pub(super) fn opened(self: &Arc<Self>) {
         for waiting in self.waiting.lock().drain(..) {
             // Nobody waits any more when the subscription was given up.
             let _ = waiting.send(());
@@ -110,11 +111,9 @@ impl Channel {
     }
 
     /// Its thread is to look for samples.
-    fn note_samples(&self) {
-        if let Some(this) = self.weak.upgrade()
-            && !self.is_ready.swap(true, Ordering::AcqRel)
-        {
-            self.ready.queue.lock().push(this);
+    fn note_samples(self: &Arc<Self>) {
+        if !self.is_ready.swap(true, Ordering::AcqRel) {
+            self.ready.queue.lock().push(Arc::clone(self));
         }
         if let Some(thread) = self.ready.thread.get() {
             thread.unpark();
@@ -122,7 +121,7 @@ impl Channel {
     }
 
     /// Takes samples until there is none, or its turn is over.
-    fn drain(&self, shared: &Shared) {
+    fn drain(self: &Arc<Self>, shared: &Shared) {
         self.is_ready.store(false, Ordering::Release);
         let mut readers = self.readers.lock();
         let Readers { by_kind, opened, seen, history, doubtful } = &mut *readers;
@@ -137,7 +136,7 @@ impl Channel {
         for (reader, kind) in by_kind.iter().zip(Kind::ALL) {
             let Some(reader) = reader else { continue };
             // Before it is emptied: what comes before a waker is set wakes nobody.
-            reader.set_waker(Some(Waker::from(Arc::new(Bell(self.weak.clone())))));
+            reader.set_waker(Some(self.waker.clone()));
             again |= self.drain_one(shared, reader, kind, &mut progress, doubtful);
         }
         let clock = |writer: EndpointId| {
@@ -327,7 +326,7 @@ impl Channels {
                 waiting: Mutex::default(),
                 is_ready: AtomicBool::new(false),
                 ready,
-                weak: weak.clone(),
+                waker: Waker::from(Arc::new(Bell(weak.clone()))),
             });
             let mut by_topic = self.by_topic.write();
             by_topic.entry(Arc::clone(&key.topic.name)).or_default().push(Arc::clone(&made));

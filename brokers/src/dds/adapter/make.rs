@@ -120,7 +120,7 @@ impl Generation {
     pub(super) fn open(
         &mut self,
         shared: &Shared,
-        channel: &Channel,
+        channel: &Arc<Channel>,
         wanted: [bool; 3],
     ) -> Result<(), DdsError> {
         let topic = (&*channel.topic.name, &*channel.topic.type_name);

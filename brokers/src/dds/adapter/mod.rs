@@ -381,7 +381,7 @@ impl OutboxAdmission for Arc<Shared> {
         self.is_down()
     }
 
-    fn takes_at_once(&self) -> bool {
+    fn write_at_once(&self) -> bool {
         send::write_at_once(self)
     }
 }

@@ -1,12 +1,12 @@
 //! Calls of services on a robot by services of the fog.
 
 use blaze_domain::control::ErrorCode;
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
 use blaze_domain::{Origin, WriterId};
 use blaze_proto::link::link_control::{Advertise, RouteState};
 use blaze_proto::{Frame, Header};
 
 use super::*;
-use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
 
 const ROBOT: &str = "edge/robot-1";
 

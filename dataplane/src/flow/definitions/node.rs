@@ -7,6 +7,7 @@ use blaze_brokers::ros2::names::{Carries, RosName};
 use blaze_brokers::ros2::{Network, RosEndpoint};
 use blaze_brokers::{Broker as _, Content, PublisherOptions, Received, SubscribeOptions};
 use blaze_convert::{DescriptionError, TypeDescription};
+use blaze_domain::media::cdr_of;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Origin, WriterId};
 use blaze_proto::{Frame, Header};
@@ -17,7 +18,6 @@ use super::super::plane::wall_ns;
 use super::super::ros2::Ros2Scope;
 use super::{ANSWER, agree};
 use crate::types::MessageType;
-use blaze_domain::media::cdr_of;
 
 const SERVICE: &str = "get_type_description";
 const REQUEST: &str = "type_description_interfaces/srv/GetTypeDescription_Request";

@@ -9,6 +9,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use blaze_domain::media::{JSON, Media, cdr_of};
 use blaze_domain::{DropReason, TopicName, WhyCode, WriterId};
 use blaze_proto::Frame;
 use smallvec::SmallVec;
@@ -22,7 +23,6 @@ use crate::lane::measure::micros;
 use crate::lane::path::{BridgeState, Phase, TopicId, TopicInfo};
 use crate::plan::Target;
 use crate::types::{Conversion, ConvertFailure, Converted, Encoding, MessageType, Wanted};
-use blaze_domain::media::{JSON, Media, cdr_of};
 
 /// Smaller payloads are converted by the thread that brings them.
 const INLINE_BELOW: usize = 16 * 1024;

@@ -1,9 +1,10 @@
 //! Calls of services: both flows on the way of one.
 
+use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
+
 use super::*;
 use crate::lane::calls::CallAnswer;
 use crate::types::{MessageType, TopicTypes, Wanted};
-use blaze_domain::media::{CALL, CALL_FAULT, CALL_REPLY};
 
 const STRING: &str = "std_msgs/msg/String";
 const ME: &str = "edge/robot-1";
