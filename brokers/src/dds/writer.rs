@@ -48,7 +48,7 @@ const AT_ONCE_BYTES: usize = 2 * 1024 * 1024;
 const STATUS_EVENTS: usize = 4;
 
 /// The vendor of Cyclone DDS, with which its identities begin.
-const CYCLONE: [u8; 2] = [0x01, 0x10];
+pub(super) const CYCLONE: [u8; 2] = [0x01, 0x10];
 /// How long samples wait until readers have acknowledged those before.
 const LONGEST_BEGIN: Duration = Duration::from_millis(200);
 

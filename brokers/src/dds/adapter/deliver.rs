@@ -12,7 +12,7 @@ use super::shared::{Shared, WriterFacts};
 use super::{Decoded, NoMessage};
 use crate::dds::EndpointId;
 use crate::dds::Sample;
-use crate::dds::writer::endpoint_of;
+use crate::dds::writer::{CYCLONE, endpoint_of};
 use crate::port::Received;
 
 /// Writers of one channel whose progress is remembered; those that are gone are forgotten first.
@@ -109,8 +109,11 @@ pub(super) fn deliver(
     let own = facts.is_some_and(|facts| facts.own);
     let moment = moment_of(shared, facts, writer, sample);
     let is_old = moment.is_some_and(|moment| {
-        // Without a reader that asks for what is kept, RustDDS gives none of it.
-        let may_be_kept = channel.with_kept || shared.channels.ask_for_kept(&channel.topic.name);
+        // Without a reader that asks for what is kept, RustDDS gives none of it. Its volatile readers
+        // request all that a writer says it has, and Cyclone DDS gives it.
+        let may_be_kept = channel.with_kept
+            || shared.channels.ask_for_kept(&channel.topic.name)
+            || writer.starts_with(&CYCLONE);
         may_be_kept && moment.is_old(nanos(opened), own, seen)
     });
     if missing > 0 && !own && !is_old && facts.is_some_and(|facts| facts.reliable) {

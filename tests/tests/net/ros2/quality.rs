@@ -96,13 +96,16 @@ fn judge(
 
 /// Every row from one release to another.
 pub(super) fn compare(from: Release, to: Release) -> anyhow::Result<()> {
+    compare_rows(from, to, &rows())
+}
+
+fn compare_rows(from: Release, to: Release, rows: &[Row]) -> anyhow::Result<()> {
     let pair = Pair::start()?;
     let (robot, cloud) = (pair.on_robot(from)?, pair.in_cloud(to)?);
-    let rows = rows();
     let writer = |row: &Row| robot.publisher(NODE, &row.topic, KIND, row.writer);
     let reader = |row: &Row| cloud.subscription(NODE, &row.topic, KIND, row.reader);
     let (mut writers, mut readers) = (Vec::new(), Vec::new());
-    for row in &rows {
+    for row in rows {
         writers.push(row.writer_first.then(|| writer(row)).transpose()?);
         readers.push((!row.writer_first).then(|| reader(row)).transpose()?);
     }
@@ -150,4 +153,11 @@ fn leave(robot: Peer, cloud: Peer) -> anyhow::Result<()> {
 #[test]
 fn qualities_of_two_networks_flow_or_are_named() -> anyhow::Result<()> {
     compare(Release::Jazzy, Release::Kilted)
+}
+
+#[test]
+fn what_cyclone_keeps_is_not_given_to_volatile_readers() -> anyhow::Result<()> {
+    let kept = |row: &Row| row.writer_first && row.writer.durable && !row.reader.durable;
+    let rows: Vec<Row> = rows().into_iter().filter(kept).collect();
+    compare_rows(Release::Cyclone, Release::Jazzy, &rows)
 }
