@@ -21,6 +21,7 @@ mod filter;
 pub mod layer;
 mod metatraffic;
 mod nudge;
+mod own_readers;
 pub(crate) mod participant;
 mod pulse;
 mod reader;

@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, UdpSocket};
+use std::ops::Deref;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,6 +17,7 @@ use rustdds::{
 
 use super::filter::{self, Attached, FilterError, Samples};
 use super::metatraffic::{Metatraffic, Sockets};
+use super::own_readers::{OwnReader, OwnReaders};
 use super::pulse::port_is_free;
 use super::reader::{OctetsSink, Reader, SampleSink, of_octets};
 use super::sample::{Cdr, CdrAdapter};
@@ -207,7 +209,19 @@ impl Profile {
 }
 
 /// A reader that nobody empties yet.
-pub(crate) type RawReader = no_key::SimpleDataReader<Cdr, CdrAdapter>;
+pub(crate) struct RawReader {
+    reader: no_key::SimpleDataReader<Cdr, CdrAdapter>,
+    /// Ends after it.
+    _own: Option<OwnReader>,
+}
+
+impl Deref for RawReader {
+    type Target = no_key::SimpleDataReader<Cdr, CdrAdapter>;
+
+    fn deref(&self) -> &Self::Target {
+        &self.reader
+    }
+}
 
 /// One participant. Dropping it says good-bye to the others and ends its threads, which may take a
 /// while when one of them hangs: drop it where that does not matter.
@@ -219,6 +233,8 @@ pub struct Participant {
     prefix: GuidPrefix,
     port: u16,
     filter: Result<Attached, FilterError>,
+    /// Those that RustDDS does not reach.
+    own_readers: Option<Arc<OwnReaders>>,
     failed: Arc<AtomicBool>,
     /// Carries the good-bye of RustDDS, so it drops last.
     metatraffic: Option<Metatraffic>,
@@ -272,9 +288,23 @@ impl Participant {
         let samples = Samples { repeated: sockets.is_some(), ..config.samples() };
         let filter = filter::attach(&[port, port + 1, multicast, multicast + 1], samples);
         warn_once(&filter);
+        let own_readers = OwnReaders::unreached(config.address, port + 1, prefix)
+            .map_err(create_error("socket"))?
+            .map(Arc::new);
         let start = |sockets| Metatraffic::start(sockets, prefix, Arc::clone(&failed));
         let metatraffic = sockets.map(start).transpose()?;
-        Ok(Self { prefix, port, filter, dds, publisher, subscriber, config, failed, metatraffic })
+        Ok(Self {
+            prefix,
+            port,
+            filter,
+            own_readers,
+            dds,
+            publisher,
+            subscriber,
+            config,
+            failed,
+            metatraffic,
+        })
     }
 
     /// Its identity on the wire.
@@ -325,7 +355,9 @@ impl Participant {
         let writer = self.make("writer", topic, profile, move |topic| {
             publisher.create_datawriter_no_key::<Cdr, CdrAdapter>(topic, Some(profile.qos()))
         })?;
-        Ok(Writer::new(writer, profile.transient_local, Arc::clone(&self.failed)))
+        let own_readers = self.own_readers.clone().filter(|_| profile.reliable);
+        let own_readers = own_readers.map(|readers| (topic.0.to_owned(), readers));
+        Ok(Writer::new(writer, profile.transient_local, own_readers, Arc::clone(&self.failed)))
     }
 
     /// Makes a reader of a topic of [`FRAME_TYPE`], and the thread that hands its samples to `sink`.
@@ -399,9 +431,12 @@ impl Participant {
         profile: Profile,
     ) -> Result<RawReader, DdsError> {
         let subscriber = self.subscriber.clone();
-        self.make("reader", topic, profile, move |topic| {
+        let reader = self.make("reader", topic, profile, move |topic| {
             subscriber.create_simple_datareader_no_key(topic, Some(profile.qos()))
-        })
+        })?;
+        let own_readers = self.own_readers.clone().filter(|_| profile.reliable);
+        let _own = own_readers.map(|readers| readers.add(topic.0, &endpoint_of(reader.guid())));
+        Ok(RawReader { reader, _own })
     }
 
     /// Makes an endpoint, in a thread of its own that can be left behind.

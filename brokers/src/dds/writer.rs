@@ -2,7 +2,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
@@ -10,6 +10,7 @@ use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, RTPSEntity, StatusEvented, WriteOptionsBuilder, no_key};
 
 use super::GuidPrefix;
+use super::own_readers::OwnReaders;
 use super::sample::{Cdr, CdrAdapter, octet_sequence};
 
 /// Identity of a reader or writer on the wire: its participant's and four bytes.
@@ -46,6 +47,9 @@ const AT_ONCE_BYTES: usize = 2 * 1024 * 1024;
 /// Events that RustDDS keeps for a writer; it drops later ones. Each reader that asks for more than
 /// the writer offers makes one.
 const STATUS_EVENTS: usize = 4;
+
+/// Samples after which own readers acknowledge that RustDDS does not reach: it keeps the others.
+const ACKNOWLEDGE_EVERY: i64 = 32;
 
 /// The vendor of Cyclone DDS, with which its identities begin.
 pub(super) const CYCLONE: [u8; 2] = [0x01, 0x10];
@@ -99,8 +103,10 @@ pub struct Writer {
     /// How many readers it has met.
     matched: AtomicUsize,
     begin: Mutex<Begin>,
-    /// Whether it has written anything.
-    wrote: AtomicBool,
+    /// Number of the last sample that it has written; 0: none.
+    last: AtomicI64,
+    /// The topic, and own readers of it that RustDDS does not reach.
+    own_readers: Option<(String, Arc<OwnReaders>)>,
     /// Late joiners get what was written before they came, so it is written without a reader, too.
     keeps: bool,
     failed: Arc<AtomicBool>,
@@ -111,11 +117,18 @@ impl Writer {
     pub(super) fn new(
         writer: no_key::DataWriter<Cdr, CdrAdapter>,
         keeps: bool,
+        own_readers: Option<(String, Arc<OwnReaders>)>,
         failed: Arc<AtomicBool>,
     ) -> Self {
-        let begin = Mutex::new(Begin::Done);
-        let (matched, wrote) = (AtomicUsize::new(0), AtomicBool::new(false));
-        Self { writer, matched, begin, wrote, keeps, failed }
+        Self {
+            writer,
+            matched: AtomicUsize::new(0),
+            begin: Mutex::new(Begin::Done),
+            last: AtomicI64::new(0),
+            own_readers,
+            keeps,
+            failed,
+        }
     }
 
     /// Hands octets to RustDDS, as a sample of [`FRAME_TYPE`](super::FRAME_TYPE). Returns whether
@@ -141,10 +154,17 @@ impl Writer {
             let options = options.best_effort_may_block(waits).build();
             match self.writer.write_with_options(cdr, options) {
                 Ok(sample) => {
-                    self.wrote.store(true, Ordering::Relaxed);
-                    Some(Written::Taken(sample.sequence_number.into()))
+                    let number = sample.sequence_number.into();
+                    self.last.store(number, Ordering::Relaxed);
+                    if number % ACKNOWLEDGE_EVERY == 0 {
+                        self.acknowledge();
+                    }
+                    Some(Written::Taken(number))
                 }
-                Err(WriteError::WouldBlock { .. }) => Some(Written::Full),
+                Err(WriteError::WouldBlock { .. }) => {
+                    self.acknowledge();
+                    Some(Written::Full)
+                }
                 Err(_) => Some(Written::Failed),
             }
         })
@@ -154,7 +174,12 @@ impl Writer {
     /// Whether all readers have acknowledged all samples; always true for best effort.
     #[must_use]
     pub fn is_acknowledged(&self) -> bool {
-        self.contain(|| self.writer.wait_for_acknowledgments(Duration::ZERO).ok()).unwrap_or(true)
+        let acknowledged =
+            self.contain(|| self.writer.wait_for_acknowledgments(Duration::ZERO).ok());
+        if acknowledged == Some(false) {
+            self.acknowledge();
+        }
+        acknowledged.unwrap_or(true)
     }
 
     /// Its identity on the wire.
@@ -178,8 +203,15 @@ impl Writer {
     fn may_begin(&self) -> bool {
         let mut begin = self.begin.lock();
         *begin == Begin::Done || {
-            let wrote = self.wrote.load(Ordering::Relaxed);
+            let wrote = self.last.load(Ordering::Relaxed) > 0;
             begin.allows(Instant::now(), self.is_acknowledged(), wrote)
+        }
+    }
+
+    /// In the name of own readers.
+    fn acknowledge(&self) {
+        if let Some((topic, own_readers)) = &self.own_readers {
+            own_readers.acknowledge(topic, &self.id(), self.last.load(Ordering::Relaxed));
         }
     }
 

@@ -168,6 +168,28 @@ async fn what_the_flow_writes_leaves_room_for_samples_that_wait_for_an_owner() {
     assert_eq!(subscription.take_dropped(), 0);
 }
 
+/// More than may be under way at once.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_topic_that_the_flow_reads_itself_is_written_without_end() {
+    let net = Net::start().await;
+    let node = net.node();
+    let writer = node.typed_writer(("rt/a", TYPE), reliable(16)).unwrap();
+    let guest = net.node();
+    let reads = Reads::start(&guest, "rt/a", reliable(256));
+    net.own(&[writer.id()]).await;
+    let mut subscription = net.read("a", SubscribeOptions::default()).await;
+    meet(&writer, &mut subscription).await;
+    net.network("both", |network| network.endpoints.len() == 2).await;
+    let large = PublisherOptions { large: true, ..RELIABLE };
+    let publisher = net.broker.publisher(&"a".parse().unwrap(), large).unwrap();
+    for number in 1..=200 {
+        publisher.publish(&frame("a", 7, number), None);
+        eventually("written", || (publisher.later().queued == 0).then_some(())).await;
+    }
+    reads.until(200).await;
+    assert_eq!(net.broker.counts().expelled, 0);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_kept_is_read_beside_other_writers_of_the_topic() {
     let net = Net::start().await;
