@@ -11,9 +11,8 @@ use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use bytes::BufMut;
 
 use super::GuidPrefix;
+use super::rtps::OWN_HEADER;
 
-/// RTPS 2.4, and RustDDS' vendor id.
-const HEADER: [u8; 8] = *b"RTPS\x02\x04\x01\x12";
 const SUBMESSAGE_DATA: u8 = 0x15;
 /// Little endian, with inline parameters, with a key instead of data.
 const FLAGS: u8 = 0x01 | 0x02 | 0x08;
@@ -72,7 +71,7 @@ pub(super) fn datagram(whose: GuidPrefix, number: u32) -> Vec<u8> {
     body.put_slice(&PARTICIPANT);
     body.put_slice(&SENTINEL);
     let mut message = Vec::with_capacity(24 + body.len());
-    message.put_slice(&HEADER);
+    message.put_slice(&OWN_HEADER);
     message.put_slice(&whose.0);
     message.put_u8(SUBMESSAGE_DATA);
     message.put_u8(FLAGS);

@@ -20,11 +20,9 @@ use nix::sys::socket::SockaddrIn;
 use parking_lot::Mutex;
 
 use super::GuidPrefix;
-use super::rtps::FLAG_LITTLE_ENDIAN;
+use super::rtps::{FLAG_LITTLE_ENDIAN, OWN_HEADER};
 use super::writer::EndpointId;
 
-/// RTPS 2.4, and RustDDS' vendor id.
-const HEADER: [u8; 8] = *b"RTPS\x02\x04\x01\x12";
 const ACKNACK: u8 = 0x06;
 /// No answer is needed.
 const FLAG_FINAL: u8 = 0x02;
@@ -123,7 +121,7 @@ fn acknowledgement(
     number: i32,
 ) -> Vec<u8> {
     let mut message = Vec::with_capacity(48);
-    message.put_slice(&HEADER);
+    message.put_slice(&OWN_HEADER);
     message.put_slice(&prefix.0);
     message.put_u8(ACKNACK);
     message.put_u8(FLAG_LITTLE_ENDIAN | FLAG_FINAL);

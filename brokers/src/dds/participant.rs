@@ -211,7 +211,7 @@ impl Profile {
 /// A reader that nobody empties yet.
 pub(crate) struct RawReader {
     reader: no_key::SimpleDataReader<Cdr, CdrAdapter>,
-    /// Ends after it.
+    /// As long as the reader stands, it is acknowledged in its name where RustDDS does not reach it.
     _own: Option<OwnReader>,
 }
 

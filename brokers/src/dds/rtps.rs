@@ -3,6 +3,8 @@
 use super::GuidPrefix;
 
 const HEADER_LENGTH: usize = 20;
+/// How own messages begin: RTPS 2.4, and RustDDS' vendor id. The prefix of the participant follows.
+pub(super) const OWN_HEADER: [u8; 8] = *b"RTPS\x02\x04\x01\x12";
 const PAD: u8 = 0x01;
 const INFO_TS: u8 = 0x09;
 pub(super) const INFO_SRC: u8 = 0x0c;

@@ -241,7 +241,8 @@ impl Routes {
         let Some(broker) = self.brokers.of(scope) else { return };
         let makes_room = !matches!(broker.kind(), BrokerKind::Dds | BrokerKind::Ros2);
         let before = match held {
-            // Who has begun with what was kept has it. DDS makes no other room than at first.
+            // Who has begun with what was kept has it. RustDDS never lowers the room of a topic, so
+            // another reader would be of no use, and lose what comes between the two.
             Some(source)
                 if (source.large == large || !makes_room)
                     && (source.with_kept || !with_kept)
