@@ -19,6 +19,10 @@ pub const MAX_TOPIC_BYTES: usize = 200;
 const BARE_PREFIX: &str = "blaze/bare/";
 /// Before the topic, the channel of its payloads as JSON.
 const JSON_PREFIX: &str = "blaze/json/";
+/// Where monitors ask those of a layer how far they are: `blaze/ping/<layer>`.
+const PING_PREFIX: &str = "blaze/ping/";
+/// Where a monitor answers: `blaze/pong/<layer>/<node>`.
+const PONG_PREFIX: &str = "blaze/pong/";
 
 /// Why a text is not a name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -92,10 +96,22 @@ fn check_topic_form(text: &str) -> Result<(), NameError> {
 
 fn check_topic(text: &str) -> Result<(), NameError> {
     check_topic_form(text)?;
-    if text == "blaze" || text.starts_with("blaze/") {
+    if text == "blaze" || text.starts_with("blaze/") && !is_of_monitors(text) {
         return Err(NameError::Reserved);
     }
     Ok(())
+}
+
+/// Whether it is one of the two kinds of topic below `blaze/` that are bridged.
+fn is_of_monitors(text: &str) -> bool {
+    let one = |name: &str| check_name(name).is_ok();
+    match (text.strip_prefix(PING_PREFIX), text.strip_prefix(PONG_PREFIX)) {
+        (Some(layer), _) => one(layer),
+        (_, Some(place)) => {
+            place.split_once('/').is_some_and(|(layer, node)| one(layer) && one(node))
+        }
+        (None, None) => false,
+    }
 }
 
 fn check_channel(text: &str) -> Result<(), NameError> {
@@ -256,6 +272,15 @@ impl From<&TopicName> for ChannelName {
     }
 }
 
+impl TopicName {
+    /// Whether it carries pings or their answers, which only `blaze-monitor` may advertise and
+    /// request.
+    #[must_use]
+    pub fn is_for_monitors_alone(&self) -> bool {
+        is_of_monitors(&self.0)
+    }
+}
+
 impl ChannelName {
     /// Where services send their control messages.
     #[must_use]
@@ -298,7 +323,7 @@ impl ChannelName {
     /// bridged.
     #[must_use]
     pub fn is_reserved(&self) -> bool {
-        self.0.starts_with("blaze/")
+        self.0.starts_with("blaze/") && !is_of_monitors(&self.0)
     }
 }
 
@@ -342,6 +367,17 @@ mod tests {
     fn topics_follow_the_contract() {
         for good in ["imu/data", "A_b-9/x", &"t".repeat(200)] {
             assert!(good.parse::<TopicName>().is_ok(), "{good}");
+        }
+        for of_monitors in ["blaze/ping/edge", "blaze/pong/edge/robot-1"] {
+            let topic = of_monitors.parse::<TopicName>().unwrap();
+            assert!(topic.is_for_monitors_alone() && !ChannelName::from(&topic).is_reserved());
+        }
+        for bad in ["blaze/ping", "blaze/ping/", "blaze/ping/a/b", "blaze/pong/a", "blaze/ping/A"] {
+            assert!(bad.parse::<TopicName>().is_err(), "{bad}");
+            assert!(
+                bad.parse::<ChannelName>().is_ok_and(|channel| channel.is_reserved())
+                    || bad.ends_with('/')
+            );
         }
         for (bad, why) in [
             ("/imu", NameError::EmptySegment),

@@ -21,6 +21,14 @@ pub(super) fn announced_bytes(holders: &[(&FlowId, &FlowView)], topic: &TopicNam
     largest.map(|bytes| bytes.min(MAX_PAYLOAD_BYTES as u64))
 }
 
+/// Whether some service advertises a topic, and whether some service requests it.
+pub(super) fn sides(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> (bool, bool) {
+    let entries = holders.iter().filter_map(|(_, view)| view.topics.get(topic));
+    entries.flat_map(TopicEntry::scopes).fold((false, false), |(advertised, requested), (_, it)| {
+        (advertised || it.advertise.is_some(), requested || it.request.is_some())
+    })
+}
+
 /// The types of a topic: that of its publishers, of all flows, and that of its readers on the own
 /// ROS 2 network.
 pub(super) fn types(

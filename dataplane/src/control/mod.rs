@@ -20,6 +20,7 @@ mod replicas;
 mod ros2;
 mod routes;
 mod scopes;
+mod topic_states;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -51,6 +52,8 @@ pub use replicas::read_replica_message;
 use ros2::Ros2;
 pub use scopes::ScopeHealth;
 use scopes::Scopes;
+pub use topic_states::TopicState;
+use topic_states::TopicStates;
 
 /// A changed topic is planned after this much quiet …
 pub const QUIET: Duration = Duration::from_millis(50);
@@ -68,6 +71,7 @@ pub struct ControlCore {
     config: ControlConfig,
     registry: Registry,
     plans: BTreeMap<TopicName, TopicPlan>,
+    topic_states: TopicStates,
     dirty: BTreeMap<TopicName, Dirty>,
     outputs: VecDeque<Output>,
     state: FlowState,
@@ -122,6 +126,7 @@ impl ControlCore {
             config,
             registry,
             plans: BTreeMap::new(),
+            topic_states: TopicStates::default(),
             dirty: BTreeMap::new(),
             outputs: VecDeque::new(),
             state: FlowState::Starting,
@@ -164,6 +169,11 @@ impl ControlCore {
     #[must_use]
     pub fn plans(&self) -> &BTreeMap<TopicName, TopicPlan> {
         &self.plans
+    }
+
+    /// Topics that the flow knows, by state.
+    pub fn topic_states(&self) -> impl Iterator<Item = (TopicState, u64)> {
+        self.topic_states.counts()
     }
 
     /// What the flow says of itself.

@@ -6,8 +6,9 @@ use std::time::Instant;
 use blaze_domain::TopicName;
 use blaze_domain::control::EventKind;
 
-use super::info::{Sources, announced_bytes, durable_sources, local_info, types};
+use super::info::{Sources, announced_bytes, durable_sources, local_info, sides, types};
 use super::routes::route_states;
+use super::topic_states::TopicState;
 use super::{ControlCore, LATEST, Output, QUIET, event};
 use crate::plan::network::{self, Servers, Shown};
 use crate::plan::{Survey, TopicPlan, plan_within};
@@ -29,6 +30,8 @@ struct Draft {
     types: TopicTypes,
     /// Some flow announces something of the topic.
     is_known: bool,
+    /// Whether some service advertises it, and requests it.
+    sides: (bool, bool),
     /// How it shows on the own ROS 2 network.
     shown: Option<Shown>,
     /// Where its requests may go.
@@ -107,6 +110,7 @@ impl ControlCore {
                 durable: durable_sources(&holders, topic),
                 max_bytes: announced_bytes(&holders, topic),
                 types: types(&self.registry, &holders, topic),
+                sides: sides(&holders, topic),
                 is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
                 shown: network::shown(&survey, topic),
                 servers: network::servers(&survey, topic),
@@ -116,8 +120,9 @@ impl ControlCore {
     }
 
     fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
-        let Draft { mut plan, durable, max_bytes, types, is_known, shown, servers } = draft;
+        let Draft { mut plan, durable, max_bytes, types, is_known, sides, shown, servers } = draft;
         self.show(topic, shown);
+        self.topic_states.set(topic, TopicState::of(sides, &plan));
         let previous = self.plans.get(topic);
         if is_known
             && previous == Some(&plan)
@@ -131,6 +136,7 @@ impl ControlCore {
         let fault = if plan.uses_layer() { self.registry.put_on_layer(topic).err() } else { None };
         if let Some(fault) = &fault {
             plan.block_layer(&self.config.me, fault.code(), &format!("{topic} {fault}"));
+            self.topic_states.set(topic, TopicState::of(sides, &plan));
         }
         if !plan.uses_layer() {
             self.registry.take_off_layer(topic);

@@ -4,6 +4,7 @@
 mod allocation;
 mod peers;
 pub(super) mod ros2;
+mod summary;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,14 +23,26 @@ use serde_json::{Map, Value, json};
 use super::Shared;
 use super::plane::wall_ms;
 use super::routes::SourceState;
-use crate::control::ControlCore;
+use crate::control::{ControlCore, TopicState};
 use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
 use crate::lane::stats::Drops;
-use crate::plan::{Form, Target};
+use crate::plan::{Form, Target, TopicPlan};
 use crate::registry::{FoundEndpoint, LeaseView, Terms};
 use crate::world::{Advertise, Request};
 
 type App = State<Arc<Shared>>;
+
+/// The topic that a question is about; without one it is about all.
+#[derive(serde::Deserialize)]
+struct Asked {
+    topic: Option<String>,
+}
+
+impl Asked {
+    fn includes(&self, topic: &TopicName) -> bool {
+        self.topic.as_deref().is_none_or(|asked| asked == topic.as_str())
+    }
+}
 
 /// The routes below `/v1`.
 pub(super) fn router(shared: Arc<Shared>) -> Router {
@@ -40,6 +53,7 @@ pub(super) fn router(shared: Arc<Shared>) -> Router {
         .route("/v1/allocation", get(allocation::allocation))
         .route("/v1/ros2", get(ros2::ros2))
         .route("/v1/ros2/types", get(ros2::types))
+        .route("/v1/summary", get(summary::summary))
         .route("/v1/why", get(super::why::why))
         .with_state(shared)
 }
@@ -66,19 +80,20 @@ fn rounded(value: f64) -> Value {
     json!((value * 1000.0).round() / 1000.0)
 }
 
-async fn topics(State(shared): App) -> Json<Value> {
+async fn topics(State(shared): App, Query(asked): Query<Asked>) -> Json<Value> {
     let now = Instant::now();
     let rates: BTreeMap<TopicName, (f64, f64)> = shared.plane.read(|state| {
-        state
-            .core
-            .topics_mut()
+        let topics = state.core.topics_mut();
+        topics
+            .filter(|(_, path)| asked.includes(&path.name))
             .map(|(_, path)| (path.name.clone(), path.in_rate.rate(now)))
             .collect()
     });
     let control = shared.control.lock();
     let registry = control.registry();
+    let no_plan = TopicPlan::default();
     let mut rows = Vec::new();
-    for topic in registry.all_topics() {
+    for topic in registry.all_topics().into_iter().filter(|topic| asked.includes(topic)) {
         let mut advertised: Vec<Value> = Vec::new();
         let mut requested: Vec<Value> = Vec::new();
         for lease in registry.leases_of(&topic) {
@@ -107,18 +122,10 @@ async fn topics(State(shared): App) -> Json<Value> {
                 remote.request.iter().map(|r| remote_request(remote.flow, remote.scope, r)),
             );
         }
-        if advertised.is_empty() && requested.is_empty() {
+        let sides = (!advertised.is_empty(), !requested.is_empty());
+        let plan = control.plans().get(&topic).unwrap_or(&no_plan);
+        let Some(state) = TopicState::of(sides, plan).map(TopicState::as_str) else {
             continue;
-        }
-        let blocked = control
-            .plans()
-            .get(&topic)
-            .is_some_and(|p| p.bridges.is_empty() && !p.blocked.is_empty());
-        let state = match (advertised.is_empty(), requested.is_empty()) {
-            (true, _) => "no_advertise",
-            (false, true) => "no_request",
-            (false, false) if blocked => "blocked",
-            (false, false) => "flowing",
         };
         let (rate_hz, bytes_per_s) = rates.get(&topic).copied().unwrap_or_default();
         rows.push(json!({
@@ -230,14 +237,15 @@ fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) 
     })
 }
 
-async fn bridges(State(shared): App) -> Json<Value> {
+async fn bridges(State(shared): App, Query(asked): Query<Asked>) -> Json<Value> {
     let now = Instant::now();
     // First the places, then whether they are subscribed: the two locks are never held together.
     let (mut rows, before_bridges) = shared.plane.read(|state| {
         let mut rows = Vec::new();
         let mut before_bridges: Vec<Value> =
             dropped_row("", &state.core.unattributed).into_iter().collect();
-        for (id, path) in state.core.topics_mut() {
+        let topics = state.core.topics_mut().filter(|(_, path)| asked.includes(&path.name));
+        for (id, path) in topics {
             before_bridges.extend(dropped_row(path.name.as_str(), &path.ingress_drops));
             path.bridges.iter_mut().for_each(|bridge| {
                 bridge.settle();
@@ -266,6 +274,7 @@ async fn bridges(State(shared): App) -> Json<Value> {
     let control = shared.control.lock();
     let plans = control.plans().iter();
     let not_owner: Vec<Value> = plans
+        .filter(|(topic, _)| asked.includes(topic))
         .filter_map(|(topic, plan)| Some(json!({"topic": topic, "owner": plan.carrier.as_ref()?})))
         .collect();
     let balance = balance(now, &control);
@@ -367,6 +376,10 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
             "p50": bridge.stats.latency.quantile_ms(0.5),
             "p99": bridge.stats.latency.quantile_ms(0.99),
         },
+        "age_ms": bridge.receiver().is_none().then(|| {
+            let ages = bridge.stats.ages.all();
+            json!({"p50": ages.quantile_ms(0.5), "p99": ages.quantile_ms(0.99)})
+        }),
         "detail": bridge.failure, "class": class, "reliable": bridge.lane.reliable,
         "max_rate_hz": bridge.lane.max_rate_hz,
         "lifespan_ms": bridge.lane.lifespan_ms,

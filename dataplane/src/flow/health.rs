@@ -57,6 +57,9 @@ pub(super) async fn watch_health(
             marked = Instant::now();
             let forgotten = shared.plane.read(|state| {
                 state.core.mark();
+                if let Some(engine) = &state.engine {
+                    state.core.keep_totals_of(|flow| engine.peer(flow).is_some());
+                }
                 state.core.forget_unused(marked)
             });
             if forgotten > 0 {

@@ -16,6 +16,7 @@ use super::{Shared, class_label};
 use crate::codec::pool::CodecPool;
 use crate::control::MoveReason;
 use crate::lane::path::{Phase, TopicId, TopicPath};
+use crate::lane::stats::BridgeStats;
 use crate::link::{Engine, PeerState};
 use crate::registry::Terms;
 use latency::Histogram;
@@ -39,18 +40,21 @@ counter blaze_flow_messages_total topic,from,to,direction Messages through a bri
 counter blaze_flow_bytes_total topic,from,to,direction Payload bytes through a bridge.
 counter blaze_flow_dropped_total topic,to,reason Messages dropped.
 gauge blaze_flow_bridges state Bridges by state.
+histogram blaze_flow_bridge_latency_seconds topic,to Time of a message in this flow.
+histogram blaze_flow_delivery_age_seconds topic,to,from_layer Age of a message when it was written \
+    to the broker.
 gauge blaze_flow_queue_bytes to,class Bytes that wait for the link or may have to be repaired.
 gauge blaze_flow_rate_hertz topic,to,kind Rates of a topic.
 gauge blaze_flow_budget_bytes_per_second to,kind Wire bytes per second.
 gauge blaze_flow_feasible to 1 while what is published fits the budget at its lowest rates.
 gauge blaze_flow_wire_factor - Wire bytes for each byte that the allocation reckons with.
 counter blaze_flow_compression_bytes_total topic,stage Payload bytes before and after compression.
-counter blaze_flow_compression_seconds topic Processor time of compression.
+counter blaze_flow_compression_seconds_total topic Processor time of compression.
 gauge blaze_flow_compression_level topic Level of now; 0: payloads go as they are.
 gauge blaze_flow_compression_pool state Threads that compress, and what waits for them.
-counter blaze_flow_compression_pool_seconds - Time that the threads were taken, all together.
+counter blaze_flow_compression_pool_seconds_total - Time that the threads were taken, all together.
 counter blaze_flow_converted_total topic,form Messages that became JSON or CDR.
-counter blaze_flow_convert_seconds topic Time that conversions took.
+counter blaze_flow_convert_seconds_total topic Time that conversions took.
 counter blaze_flow_wire_bytes_total to,class IP bytes sent on the inter scope.
 gauge blaze_flow_peer_up peer 1 while the peer says Hello and acknowledges.
 gauge blaze_flow_peer_rtt_seconds peer Round trip to the peer.
@@ -66,6 +70,24 @@ gauge process_start_time_seconds - When the flow started, since 1970.
 gauge blaze_build_info version,program 1, with the version as label.
 ";
 
+/// Times of bridges, by their labels.
+#[derive(Default)]
+struct Histograms {
+    latency: BTreeMap<String, Histogram>,
+    age: BTreeMap<String, Histogram>,
+}
+
+impl Histograms {
+    fn add(&mut self, topic: &str, to: &str, stats: &BridgeStats) {
+        let labels = format!("topic=\"{topic}\",to=\"{to}\"");
+        for (layer, ages) in stats.ages.iter() {
+            let labels = format!("{labels},from_layer=\"{layer}\"");
+            self.age.entry(labels).or_default().add(ages);
+        }
+        self.latency.entry(labels).or_default().add(&stats.latency);
+    }
+}
+
 /// All metrics, without values at first.
 struct Page {
     registry: Registry,
@@ -75,6 +97,8 @@ struct Page {
 enum Metric {
     Counter(CounterVec),
     Gauge(GaugeVec),
+    /// Written by hand, from the histograms of the bridges.
+    Histogram(&'static str),
 }
 
 impl Page {
@@ -89,6 +113,8 @@ impl Page {
                 let counter = CounterVec::new(Opts::new(name, help), &labels)?;
                 page.registry.register(Box::new(counter.clone()))?;
                 Metric::Counter(counter)
+            } else if kind == "histogram" {
+                Metric::Histogram(help)
             } else {
                 let gauge = GaugeVec::new(Opts::new(name, help), &labels)?;
                 page.registry.register(Box::new(gauge.clone()))?;
@@ -108,7 +134,9 @@ impl Page {
             Some(Metric::Gauge(gauge)) => {
                 gauge.get_metric_with_label_values(labels).map(|gauge| gauge.add(value))
             }
-            None => Err(prometheus::Error::Msg("it is not in the table".to_owned())),
+            Some(Metric::Histogram(_)) | None => {
+                Err(prometheus::Error::Msg("it is not in the table".to_owned()))
+            }
         };
         debug_assert!(added.is_ok(), "{name} {labels:?}: {added:?}");
         if let Err(error) = added {
@@ -139,7 +167,7 @@ impl Page {
     fn fill_topics(&self, shared: &Shared) -> String {
         let now = Instant::now();
         let sources = shared.routes.source_states();
-        let mut histograms: BTreeMap<(String, String), Histogram> = BTreeMap::new();
+        let mut histograms = Histograms::default();
         shared.plane.read(|state| {
             for (reason, count) in state.core.unattributed.iter() {
                 self.add("blaze_flow_dropped_total", &["", "", reason.as_str()], count as f64);
@@ -151,14 +179,17 @@ impl Page {
             }
         });
         let mut text = String::new();
-        if !histograms.is_empty() {
-            text.push_str(
-                "# HELP blaze_flow_bridge_latency_seconds Time of a message in this flow.\n",
-            );
-            text.push_str("# TYPE blaze_flow_bridge_latency_seconds histogram\n");
-        }
-        for ((topic, to), histogram) in histograms {
-            histogram.write(&topic, &to, &mut text);
+        for (name, histograms) in [
+            ("blaze_flow_bridge_latency_seconds", histograms.latency),
+            ("blaze_flow_delivery_age_seconds", histograms.age),
+        ] {
+            let Some(Metric::Histogram(help)) = self.metrics.get(name) else { continue };
+            if !histograms.is_empty() {
+                text.push_str(&format!("# HELP {name} {help}\n# TYPE {name} histogram\n"));
+            }
+            for (labels, histogram) in histograms {
+                histogram.write(name, &labels, &mut text);
+            }
         }
         text
     }
@@ -169,7 +200,7 @@ impl Page {
         (topic, id): (&str, TopicId),
         path: &mut TopicPath,
         sources: &BTreeMap<(TopicId, Scope), SourceState>,
-        histograms: &mut BTreeMap<(String, String), Histogram>,
+        histograms: &mut Histograms,
     ) {
         for (reason, count) in path.ingress_drops.iter() {
             self.add("blaze_flow_dropped_total", &[topic, "", reason.as_str()], count as f64);
@@ -179,7 +210,7 @@ impl Page {
             for (stage, bytes) in [("before", stats.before), ("after", stats.after)] {
                 self.add("blaze_flow_compression_bytes_total", &[topic, stage], bytes as f64);
             }
-            self.add("blaze_flow_compression_seconds", &[topic], stats.seconds);
+            self.add("blaze_flow_compression_seconds_total", &[topic], stats.seconds);
             // Topics that share a label have no level in common.
             if topic != OTHER {
                 self.add("blaze_flow_compression_level", &[topic], f64::from(path.level()));
@@ -192,7 +223,7 @@ impl Page {
             }
         }
         if stats.json + stats.cdr > 0 {
-            self.add("blaze_flow_convert_seconds", &[topic], stats.seconds);
+            self.add("blaze_flow_convert_seconds_total", &[topic], stats.seconds);
         }
         let measured = path.in_rate.rate(now).0;
         let granted = path.granted.map(|granted| granted.advertised_hz);
@@ -219,7 +250,7 @@ impl Page {
             for (reason, count) in stats.dropped.iter() {
                 self.add("blaze_flow_dropped_total", &[topic, &to, reason.as_str()], count as f64);
             }
-            histograms.entry((topic.to_owned(), to.clone())).or_default().add(bridge);
+            histograms.add(topic, &to, stats);
             let source = sources.get(&(id, bridge.from));
             let state = match (bridge.phase, source) {
                 (Phase::Failed { .. }, _) | (Phase::Up { .. }, Some(SourceState::Failed(_))) => {
@@ -352,7 +383,7 @@ impl Page {
         ] {
             self.add("blaze_flow_compression_pool", &[state], value as f64);
         }
-        self.add("blaze_flow_compression_pool_seconds", &[], pool.busy.as_secs_f64());
+        self.add("blaze_flow_compression_pool_seconds_total", &[], pool.busy.as_secs_f64());
         self.count(&[("compression_refused", stage.refused), ("compression_failed", stage.failed)]);
     }
 

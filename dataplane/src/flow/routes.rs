@@ -177,6 +177,13 @@ impl Routes {
         states.collect()
     }
 
+    /// The states of sources that are not subscribed: few, or the broker is away.
+    pub(super) fn not_subscribed(&self) -> Vec<(TopicId, Scope, SourceState)> {
+        let sources = self.sources.lock();
+        let states = sources.iter().map(|((id, scope), it)| (*id, *scope, it.state.lock().clone()));
+        states.filter(|(_, _, state)| *state != SourceState::Subscribed).collect()
+    }
+
     /// Ends all source tasks.
     pub(super) fn stop(&self) {
         for (_, source) in std::mem::take(&mut *self.sources.lock()) {

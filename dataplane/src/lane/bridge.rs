@@ -267,6 +267,7 @@ impl BridgeState {
         match writer.publish(frame, *bare, deadline) {
             PublishOutcome::Taken => {
                 self.stats.latency.record(here_us);
+                self.stats.ages.record(frame.origin_layer(), frame.age_us());
                 self.out_rate.add(now, frame.payload().len() as u64);
             }
             PublishOutcome::Dropped => self.stats.dropped.add(DropReason::BrokerError, 1),

@@ -31,7 +31,7 @@ use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
 use super::places::topic_id;
 use super::reading::For;
-use super::stats::Drops;
+use super::stats::{Drops, Phases, Totals};
 use super::succession::Succession;
 use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
@@ -151,6 +151,7 @@ pub struct DataCore {
     pub(super) begun: Vec<(TopicId, usize)>,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
+    totals: Totals,
     /// Topics with lanes, and some that had one.
     pub(super) leaving: BTreeSet<TopicId>,
     /// What lanes have sent.
@@ -189,6 +190,7 @@ impl DataCore {
             convert_failures: Vec::new(),
             begun: Vec::new(),
             unattributed: Drops::default(),
+            totals: Totals::default(),
             leaving: BTreeSet::new(),
             reckoned: Reckoned::default(),
             allocation_due: false,
@@ -262,7 +264,29 @@ impl DataCore {
     /// Puts a mark into the counters of every bridge: what happened since the one before is
     /// "lately".
     pub fn mark(&mut self) {
-        self.topics.iter_mut().for_each(TopicPath::mark);
+        let totals = &mut self.totals;
+        totals.phases = Phases::default();
+        self.topics.iter_mut().for_each(|path| path.mark(totals));
+    }
+
+    /// What all bridges did up to the last mark.
+    #[must_use]
+    pub fn totals(&self) -> &Totals {
+        &self.totals
+    }
+
+    /// Forgets what was dropped on the way to flows that are no longer known.
+    pub fn keep_totals_of(&mut self, is_known: impl Fn(&FlowId) -> bool) {
+        self.totals.dropped_to.retain(|flow, _| is_known(flow));
+    }
+
+    /// Bridges that take messages from a scope of a topic, if the topic is still there.
+    #[must_use]
+    pub fn bridges_up_from(&self, topic: TopicId, from: Scope) -> u64 {
+        let path = self.topics.get(topic.0 as usize);
+        let bridges = path.map(|path| path.bridges.iter()).unwrap_or_default();
+        let is_up = |bridge: &&BridgeState| matches!(bridge.phase, Phase::Up { .. });
+        bridges.filter(|bridge| bridge.from == from).filter(is_up).count() as u64
     }
 
     /// Changes what counts as large, from the next message on.

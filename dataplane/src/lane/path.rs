@@ -15,7 +15,7 @@ use super::core::FORGET;
 use super::load::LoadMeter;
 use super::measure::RateMeter;
 use super::reading::Places;
-use super::stats::{BridgeStats, Drops};
+use super::stats::{BridgeStats, Drops, Totals};
 use super::succession::{Held, Unwritten};
 use super::writer::Writer;
 use crate::limit::gate::Gate;
@@ -305,6 +305,8 @@ pub struct TopicPath {
     pub in_rate: RateMeter,
     /// Dropped before any bridge: echoes, duplicates, what could not be read.
     pub ingress_drops: Drops,
+    /// Those at the last mark.
+    ingress_drops_marked: Drops,
     /// Those of them that people ask for, by the scope that they came from.
     refused: [Refused; SCOPES],
     /// Those at two moments, so that what happened lately can be told.
@@ -347,6 +349,7 @@ impl TopicPath {
             gates: LaneGates::default(),
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
+            ingress_drops_marked: Drops::default(),
             refused: Default::default(),
             refused_marks: Default::default(),
             places: Places::default(),
@@ -357,11 +360,25 @@ impl TopicPath {
     }
 
     /// Puts a mark into all counters.
-    pub(super) fn mark(&mut self) {
+    pub(super) fn mark(&mut self, totals: &mut Totals) {
         self.refused_marks = [self.refused_marks[1], self.refused];
+        for (reason, count) in self.ingress_drops.since(&self.ingress_drops_marked) {
+            totals.dropped.add(reason, count);
+        }
+        self.ingress_drops_marked = self.ingress_drops.clone();
         for bridge in &mut self.bridges {
             bridge.settle();
-            bridge.stats.mark();
+            let to = match &bridge.target {
+                Target::Inter { receiver, .. } => Some(receiver),
+                Target::Node(_) | Target::Layer { .. } | Target::Ros2 => None,
+            };
+            bridge.stats.mark(totals, to);
+            match bridge.phase {
+                Phase::Up { .. } => totals.phases.up += 1,
+                Phase::Draining { .. } => totals.phases.draining += 1,
+                Phase::Failed { .. } => totals.phases.failed += 1,
+                Phase::Ended => {}
+            }
         }
     }
 

@@ -2,7 +2,9 @@
 //! brokers' adapters did since is in them after
 //! [`BridgeState::settle`](super::path::BridgeState::settle).
 
-use blaze_domain::DropReason;
+use std::collections::BTreeMap;
+
+use blaze_domain::{DropReason, FlowId, LayerName};
 
 use super::measure::LatencyHistogram;
 
@@ -72,11 +74,99 @@ impl Drops {
     }
 }
 
+/// Origin layers that ages are kept apart for; those of others count together.
+const MAX_ORIGINS: usize = 16;
+/// The name of those others.
+pub const OTHER: &str = "_other";
+
+/// Ages of messages when they were written to a broker, by the layer that they come from.
+#[derive(Debug, Clone, Default)]
+pub struct Ages(Vec<(String, LatencyHistogram)>);
+
+impl Ages {
+    /// Counts a message of a layer with its age in microseconds.
+    pub fn record(&mut self, layer: &str, age_us: u64) {
+        if let Some((_, ages)) = self.0.iter_mut().find(|(it, _)| it == layer) {
+            ages.record(age_us);
+            return;
+        }
+        // The name comes from the message: it may be anything.
+        let has_room = self.0.len() < MAX_ORIGINS && layer.parse::<LayerName>().is_ok();
+        if !has_room && layer != OTHER {
+            return self.record(OTHER, age_us);
+        }
+        let mut ages = LatencyHistogram::default();
+        ages.record(age_us);
+        self.0.push((layer.to_owned(), ages));
+    }
+
+    /// All layers of origin with the ages of their messages.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &LatencyHistogram)> {
+        self.0.iter().map(|(layer, ages)| (layer.as_str(), ages))
+    }
+
+    /// All ages together.
+    #[must_use]
+    pub fn all(&self) -> LatencyHistogram {
+        let mut all = LatencyHistogram::default();
+        self.0.iter().for_each(|(_, ages)| all.merge(ages));
+        all
+    }
+}
+
+/// Bridges by what they are doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Phases {
+    /// Take messages in.
+    pub up: u64,
+    /// Empty their queue.
+    pub draining: u64,
+    /// Have no writer.
+    pub failed: u64,
+}
+
+/// What all bridges of a flow have done since its start, up to the last mark. It outlives the
+/// bridges, so that it never decreases.
+#[derive(Debug, Clone, Default)]
+pub struct Totals {
+    /// Taken in.
+    pub taken: Count,
+    /// Written.
+    pub out: Count,
+    /// Dropped, by reason.
+    pub dropped: Drops,
+    /// Dropped on the way to other flows.
+    pub dropped_to: BTreeMap<FlowId, u64>,
+    /// The bridges at the mark.
+    pub phases: Phases,
+}
+
+impl Totals {
+    /// Adds what a bridge has done between two marks.
+    fn add(&mut self, before: &Mark, after: &Mark, to: Option<&FlowId>) {
+        for (sum, before, after) in
+            [(&mut self.taken, before.taken, after.taken), (&mut self.out, before.out, after.out)]
+        {
+            // A message that moved to another bridge is taken back there.
+            sum.add_many(
+                after.messages.saturating_sub(before.messages),
+                after.bytes.saturating_sub(before.bytes),
+            );
+        }
+        for (reason, count) in after.dropped.since(&before.dropped) {
+            self.dropped.add(reason, count);
+            if let Some(to) = to {
+                *self.dropped_to.entry(to.clone()).or_default() += count;
+            }
+        }
+    }
+}
+
 /// Counters of a bridge at one moment, so that what happened lately can be told.
 #[derive(Debug, Clone, Default)]
 pub struct Mark {
-    taken: u64,
-    out: u64,
+    taken: Count,
+    out: Count,
     dropped: Drops,
 }
 
@@ -104,17 +194,17 @@ pub struct BridgeStats {
     /// Time that the messages spent in this flow until they were written; on the link until their
     /// last byte was sent.
     pub latency: LatencyHistogram,
+    /// How old messages were when they were written to a broker.
+    pub ages: Ages,
     marks: [Mark; 2],
 }
 
 impl BridgeStats {
-    /// Puts a mark, from which [`BridgeStats::lately`] counts once the next one is put.
-    pub fn mark(&mut self) {
-        let mark = Mark {
-            taken: self.taken.messages,
-            out: self.out.messages,
-            dropped: self.dropped.clone(),
-        };
+    /// Puts a mark, from which [`BridgeStats::lately`] counts once the next one is put, and adds
+    /// what happened since the last one to the totals. `to`: the flow that the bridge writes to.
+    pub fn mark(&mut self, totals: &mut Totals, to: Option<&FlowId>) {
+        let mark = Mark { taken: self.taken, out: self.out, dropped: self.dropped.clone() };
+        totals.add(&self.marks[1], &mark, to);
         self.marks = [std::mem::take(&mut self.marks[1]), mark];
     }
 
@@ -123,8 +213,8 @@ impl BridgeStats {
     pub fn lately(&self) -> Lately {
         let before = &self.marks[0];
         Lately {
-            taken: self.taken.messages - before.taken,
-            out: self.out.messages - before.out,
+            taken: self.taken.messages.saturating_sub(before.taken.messages),
+            out: self.out.messages - before.out.messages,
             dropped: self.dropped.since(&before.dropped),
         }
     }
@@ -133,5 +223,39 @@ impl BridgeStats {
     #[must_use]
     pub fn queued(&self) -> u64 {
         self.taken.messages.saturating_sub(self.out.messages).saturating_sub(self.dropped.total())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ages_are_kept_by_layer_and_what_is_no_layer_or_too_many_counts_together() {
+        let mut ages = Ages::default();
+        ages.record("edge", 1_000);
+        ages.record("bad\"\n", 2_000);
+        for number in 0..2 * MAX_ORIGINS {
+            ages.record(&format!("l{number}"), 3_000);
+        }
+        assert_eq!(ages.0.len(), MAX_ORIGINS);
+        assert_eq!(ages.all().count(), 2 + 2 * MAX_ORIGINS as u64);
+        assert!(ages.iter().all(|(layer, _)| layer == OTHER || layer.parse::<LayerName>().is_ok()));
+    }
+
+    #[test]
+    fn totals_outlive_bridges_and_count_each_message_once() {
+        let (mut totals, cloud) = (Totals::default(), "cloud/cloud-1".parse::<FlowId>().unwrap());
+        for _ in 0..2 {
+            let mut bridge = BridgeStats::default();
+            bridge.taken.add_many(3, 30);
+            bridge.mark(&mut totals, Some(&cloud));
+            bridge.out.add(10);
+            bridge.dropped.add(DropReason::QueueFull, 2);
+            bridge.mark(&mut totals, Some(&cloud));
+            bridge.mark(&mut totals, Some(&cloud));
+        }
+        assert_eq!((totals.taken.messages, totals.taken.bytes, totals.out.messages), (6, 60, 2));
+        assert_eq!((totals.dropped.total(), totals.dropped_to[&cloud]), (4, 4));
     }
 }

@@ -19,6 +19,8 @@ use super::{
 use crate::names::{ChannelName, InstanceName, NameError, TopicName};
 use crate::qos::{Durability, Reliability};
 
+/// The service that may ping.
+const MONITOR: &str = "blaze-monitor";
 /// Larger calls are not read, not even to answer them.
 const MAX_LARGE_CALL_BYTES: usize = 1024 * 1024;
 
@@ -136,6 +138,7 @@ fn parse_message(
         id,
         reply_to,
     };
+    fields.check_monitor(&common)?;
     Ok(match op {
         Op::Advertise => ControlMessage::Advertise(AdvertiseMessage {
             common,
@@ -215,6 +218,15 @@ impl Fields<'_> {
             };
             self.error(code, "topic", error.to_string())
         })
+    }
+
+    /// Pings and their answers are carried for monitors alone.
+    fn check_monitor(&self, common: &Common) -> Result<(), ControlError> {
+        if !common.topic.is_for_monitors_alone() || common.service.as_str() == MONITOR {
+            return Ok(());
+        }
+        let detail = format!("is reserved for the service {MONITOR}");
+        Err(self.error(ErrorCode::ReservedTopic, "topic", detail))
     }
 
     fn reply_to(&self) -> Result<Option<ChannelName>, ControlError> {

@@ -129,6 +129,7 @@ fn every_fault_has_its_code_and_place() {
         ("advertise", "topic", json!("t".repeat(201)), ErrorCode::InvalidTopic, "/topic"),
         ("advertise", "topic", json!(5), bad, "/topic"),
         ("advertise", "topic", json!("blaze"), ErrorCode::ReservedTopic, "/topic"),
+        ("request", "topic", json!("blaze/ping/edge"), ErrorCode::ReservedTopic, "/topic"),
         ("request", "topic", json!("blaze/flow/control"), ErrorCode::ReservedTopic, "/topic"),
         ("request", "from", json!("edge"), bad, "/from"),
         ("request", "from", json!({"layer": "Edge"}), bad, "/from/layer"),

@@ -14,6 +14,7 @@ mod brokers;
 mod control_plane;
 mod effect;
 mod flow;
+mod monitor;
 mod pattern;
 mod plan_file;
 mod readers;
@@ -44,12 +45,13 @@ pub use flow::{
     BandwidthSection, Codec, Compression, CompressionOverride, FlowSection, LARGE_BYTES, LinkLimit,
     SharePolicy, TopicRule, TopicSettings, TopicValues, WireOverhead,
 };
+pub use monitor::{LatencyRule, MonitorSection, Observe, Stamp, Thresholds};
 pub use pattern::{PatternError, TopicPattern};
 pub use plan_file::{FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedLane, PlannedTopic};
 pub use ros2::{Ros2Distro, Ros2Live, Ros2Plugin};
 pub use services::{
     AdminSection, CacheSection, ConfigSection, DatabaseSection, LogFormat, LogSection,
-    MongoSection, MonitorSection, WorkerSection,
+    MongoSection, WorkerSection,
 };
 
 use crate::MAX_PAYLOAD_BYTES;

@@ -1,4 +1,4 @@
-//! Sections of the worker, the monitor and of every program: `admin`, `log`, `config`, `cache`,
+//! Sections of the worker and of every program: `admin`, `log`, `config`, `cache`,
 //! `database`.
 
 use std::net::{Ipv4Addr, SocketAddr};
@@ -7,7 +7,6 @@ use std::path::PathBuf;
 use super::readers::{formed, parsed, path, whole};
 use super::walk::{Node, Section, from_empty};
 use super::{AutoBool, RedisBroker, SecretText, auto_bool, url};
-use crate::names::TopicName;
 use crate::qos::word_enum;
 
 /// Where each program answers `/livez`, `/readyz` and `/metrics`.
@@ -171,30 +170,6 @@ fn names_user_alone(uri: &str) -> bool {
     let place = uri.split_once("://").map_or(uri, |(_, place)| place);
     let hosts = place.split(['/', '?']).next().unwrap_or_default();
     hosts.rsplit_once('@').is_some_and(|(user, _)| !user.is_empty() && !user.contains([':', '@']))
-}
-
-/// `monitor`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct MonitorSection {
-    /// Between two rounds of pings, in seconds.
-    pub ping_period_s: u32,
-    /// Topics whose latency is measured.
-    pub latency_topics: Vec<TopicName>,
-}
-
-impl Default for MonitorSection {
-    fn default() -> Self {
-        from_empty(Self::section)
-    }
-}
-
-impl MonitorSection {
-    pub(super) fn section(s: &mut Section<'_>) -> Self {
-        Self {
-            ping_period_s: s.or("ping_period_s", whole(1, 86_400), 60),
-            latency_topics: s.list("latency_topics", parsed),
-        }
-    }
 }
 
 word_enum!(

@@ -1,6 +1,6 @@
 //! Latencies in Prometheus' words.
 
-use crate::lane::path::BridgeState;
+use crate::lane::measure::LatencyHistogram;
 
 /// Upper bounds of the latency buckets in seconds.
 const BUCKETS: [f64; 14] =
@@ -15,8 +15,7 @@ pub(super) struct Histogram {
 }
 
 impl Histogram {
-    pub(super) fn add(&mut self, bridge: &BridgeState) {
-        let latency = &bridge.stats.latency;
+    pub(super) fn add(&mut self, latency: &LatencyHistogram) {
         for (below, bound) in self.below.iter_mut().zip(BUCKETS) {
             *below += latency.count_up_to_us((bound * 1e6) as u64);
         }
@@ -24,10 +23,9 @@ impl Histogram {
         self.sum_s += latency.sum_us() as f64 / 1e6;
     }
 
-    pub(super) fn write(&self, topic: &str, to: &str, text: &mut String) {
+    /// `labels`: as they stand between the braces.
+    pub(super) fn write(&self, name: &str, labels: &str, text: &mut String) {
         use std::fmt::Write as _;
-        let labels = format!("topic=\"{topic}\",to=\"{to}\"");
-        let name = "blaze_flow_bridge_latency_seconds";
         for (below, bound) in self.below.iter().zip(BUCKETS) {
             let _ = writeln!(text, "{name}_bucket{{{labels},le=\"{bound}\"}} {below}");
         }

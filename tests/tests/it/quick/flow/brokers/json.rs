@@ -94,7 +94,7 @@ async fn ros_messages_become_json() {
     let metrics = node.get("/metrics").to_string();
     let counted = r#"blaze_flow_converted_total{form=\"json\",topic=\"cmd_vel\"} 2"#;
     assert!(metrics.contains(counted), "{metrics}");
-    assert!(metrics.contains("blaze_flow_convert_seconds"));
+    assert!(metrics.contains("blaze_flow_convert_seconds_total"));
     node.end().await;
 }
 

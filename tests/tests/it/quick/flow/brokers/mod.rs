@@ -352,3 +352,44 @@ async fn what_a_broker_drops_later_is_counted_and_explained() {
     assert_eq!(counts(), (10, 4, 4000, 0));
     node.end().await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_summary_says_what_the_lists_say_and_a_question_may_be_about_one_topic() {
+    let (redis, kafka) = (Server::new(BrokerKind::Redis), Server::new(BrokerKind::Kafka));
+    let node = Node::started("fog/fog-1", &redis, &kafka).await;
+    make_route(&node, &redis, &kafka, "imu/data").await;
+    make_route(&node, &redis, &kafka, "odom").await;
+    control(&redis, &lease("advertise", "lonely"));
+    send(&redis, "imu/data", vec![1; 100]);
+    until("the summary agrees", || {
+        let summary = node.get("/v1/summary");
+        summary["topics"] == json!({"flowing": 2, "no_request": 1})
+            && summary["bridges"] == json!({"up": 2})
+            && summary["out"] == json!({"messages": 1, "bytes": 100})
+    })
+    .await;
+    let summary = node.get("/v1/summary");
+    assert_eq!((&summary["state"], &summary["feasible"]), (&json!("ready"), &json!(true)));
+
+    let rows = node.get("/v1/bridges?topic=imu/data");
+    assert_eq!(rows["bridges"].as_array().unwrap().len(), 1);
+    assert!(rows["bridges"][0]["age_ms"]["p50"].is_number(), "{rows}");
+    let topics = node.get("/v1/topics?topic=lonely");
+    assert_eq!(
+        (topics["topics"].as_array().unwrap().len(), &topics["topics"][0]["state"]),
+        (1, &json!("no_request"))
+    );
+    let metrics = node.get("/metrics").to_string();
+    let age = "blaze_flow_delivery_age_seconds_count{topic=\\\"imu/data\\\",to=\\\"layer\\\",from_layer=\\\"fog\\\"} 1";
+    assert!(metrics.contains(age), "{metrics}");
+
+    // What ended stays in the sums.
+    control(&redis, &json!({"op": "withdraw", "topic": "lonely", "service": "svc"}));
+    control(&redis, &json!({"op": "withdraw", "topic": "imu/data", "service": "svc"}));
+    until("states follow", || {
+        node.get("/v1/summary")["topics"] == json!({"flowing": 1, "no_advertise": 1})
+    })
+    .await;
+    assert_eq!(node.get("/v1/summary")["out"]["messages"], 1);
+    node.end().await;
+}
