@@ -16,14 +16,13 @@ use super::{Shared, class_label};
 use crate::codec::pool::CodecPool;
 use crate::control::MoveReason;
 use crate::lane::path::{Phase, TopicId, TopicPath};
-use crate::lane::stats::BridgeStats;
+use crate::lane::stats::{BridgeStats, OTHER};
 use crate::link::{Engine, PeerState};
 use crate::registry::Terms;
 use latency::Histogram;
 
 /// Topics that have label values of their own; the rest share one.
 const MAX_TOPICS: u32 = 1000;
-const OTHER: &str = "_other";
 
 /// The text of one scrape.
 pub(super) fn render(shared: &Shared) -> String {

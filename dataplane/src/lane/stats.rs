@@ -76,7 +76,7 @@ impl Drops {
 
 /// Origin layers that ages are kept apart for; those of others count together.
 const MAX_ORIGINS: usize = 16;
-/// The name of those others.
+/// The value of a label that stands for all that have none of their own.
 pub const OTHER: &str = "_other";
 
 /// Ages of messages when they were written to a broker, by the layer that they come from.
@@ -125,8 +125,8 @@ pub struct Phases {
     pub failed: u64,
 }
 
-/// What all bridges of a flow have done since its start, up to the last mark. It outlives the
-/// bridges, so that it never decreases.
+/// What all bridges of a flow have done since its start, up to the last mark, those that are gone
+/// included.
 #[derive(Debug, Clone, Default)]
 pub struct Totals {
     /// Taken in.
@@ -147,11 +147,9 @@ impl Totals {
         for (sum, before, after) in
             [(&mut self.taken, before.taken, after.taken), (&mut self.out, before.out, after.out)]
         {
-            // A message that moved to another bridge is taken back there.
-            sum.add_many(
-                after.messages.saturating_sub(before.messages),
-                after.bytes.saturating_sub(before.bytes),
-            );
+            // Less than before where a message was taken back, to go to another bridge.
+            sum.messages = (sum.messages + after.messages).saturating_sub(before.messages);
+            sum.bytes = (sum.bytes + after.bytes).saturating_sub(before.bytes);
         }
         for (reason, count) in after.dropped.since(&before.dropped) {
             self.dropped.add(reason, count);
@@ -250,6 +248,10 @@ mod tests {
             let mut bridge = BridgeStats::default();
             bridge.taken.add_many(3, 30);
             bridge.mark(&mut totals, Some(&cloud));
+            // One is taken back and comes again.
+            bridge.taken.remove(10);
+            bridge.mark(&mut totals, Some(&cloud));
+            bridge.taken.add(10);
             bridge.out.add(10);
             bridge.dropped.add(DropReason::QueueFull, 2);
             bridge.mark(&mut totals, Some(&cloud));
