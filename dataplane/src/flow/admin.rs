@@ -93,7 +93,11 @@ async fn topics(State(shared): App, Query(asked): Query<Asked>) -> Json<Value> {
     let registry = control.registry();
     let no_plan = TopicPlan::default();
     let mut rows = Vec::new();
-    for topic in registry.all_topics().into_iter().filter(|topic| asked.includes(topic)) {
+    let topics = match &asked.topic {
+        Some(topic) => topic.parse().into_iter().collect(),
+        None => registry.all_topics(),
+    };
+    for topic in topics {
         let mut advertised: Vec<Value> = Vec::new();
         let mut requested: Vec<Value> = Vec::new();
         for lease in registry.leases_of(&topic) {

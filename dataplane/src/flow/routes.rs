@@ -180,8 +180,9 @@ impl Routes {
     /// The states of sources that are not subscribed: few, or the broker is away.
     pub(super) fn not_subscribed(&self) -> Vec<(TopicId, Scope, SourceState)> {
         let sources = self.sources.lock();
-        let states = sources.iter().map(|((id, scope), it)| (*id, *scope, it.state.lock().clone()));
-        states.filter(|(_, _, state)| *state != SourceState::Subscribed).collect()
+        let states = sources.iter().map(|(key, source)| (*key, source.state.lock()));
+        let others = states.filter(|(_, state)| **state != SourceState::Subscribed);
+        others.map(|((topic, scope), state)| (topic, scope, state.clone())).collect()
     }
 
     /// Ends all source tasks.

@@ -1,5 +1,6 @@
-//! `GET /v1/summary`: the flow at a glance. It is as short and as cheap with 5,000 topics as with
-//! one: the sums are kept while topics are planned, and every two seconds while bridges are marked.
+//! `GET /v1/summary`: the flow at a glance, as short with 5,000 topics as with one. It walks over no
+//! topics and bridges: the sums are kept where topics are planned, and every two seconds where
+//! bridges are marked.
 
 use std::collections::BTreeMap;
 
