@@ -17,7 +17,8 @@ fn generate() -> Result<(), Box<dyn std::error::Error>> {
 
 #[cfg(feature = "config")]
 fn generate() -> Result<(), Box<dyn std::error::Error>> {
-    const CONFIG: [&str; 2] = ["blaze/v1/config.proto", "blaze/v1/sync.proto"];
+    const CONFIG: [&str; 3] =
+        ["blaze/v1/config.proto", "blaze/v1/sync.proto", "blaze/v1/status.proto"];
 
     // What reflection tells: the services and what they need, nothing else of the package.
     let services = protox::compile(CONFIG, ["proto"])?;

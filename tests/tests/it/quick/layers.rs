@@ -28,6 +28,10 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("blaze-worker", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),
     ("blaze-sdk", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),
     (
+        "blaze-monitor",
+        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers", "blaze-sdk"],
+    ),
+    (
         "blaze",
         &[
             "blaze-convert",
@@ -75,7 +79,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
 const OUTSIDE: &[(&str, &[&str])] = &[
     // The tests have a plain DDS program, which knows nothing of BlazeAIoT.
     ("rustdds", &["blaze-brokers", "blaze-tests", "blaze-bench"]),
-    ("axum", &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker"]),
+    ("axum", &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker", "blaze-monitor"]),
     (
         "anyhow",
         &[
@@ -83,6 +87,7 @@ const OUTSIDE: &[(&str, &[&str])] = &[
             "blaze-flow",
             "blaze-config",
             "blaze-worker",
+            "blaze-monitor",
             "blaze",
             "blaze-tests",
             "blaze-bench",
@@ -98,6 +103,7 @@ const OUTSIDE: &[(&str, &[&str])] = &[
             "blaze-flow",
             "blaze-config",
             "blaze-worker",
+            "blaze-monitor",
             "blaze-sdk",
             "blaze",
             "blaze-conformance",

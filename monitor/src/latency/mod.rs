@@ -1,0 +1,1 @@
+//! How long messages take from their publishers to this node.
