@@ -156,8 +156,10 @@ def fastdds() -> None:
     root = HOME / "fastdds" / "root"
     unpack_debian(pins("fastdds"), root)
     libraries = next(root.glob("usr/lib/*/libfastrtps.so")).parent
+    headers = next(root.glob("usr/include/*/fastrtps/config.h")).parent.parent
     new = BIN / "fastdds-peer.new"
-    run("g++", "-std=c++17", "-O1", "-Wall", "-Werror", "-isystem", root / "usr" / "include", FASTDDS_PEER, "-o", new,
+    run("g++", "-std=c++17", "-O1", "-Wall", "-Werror",
+        "-isystem", root / "usr" / "include", "-isystem", headers, FASTDDS_PEER, "-o", new,
         f"-L{libraries}", "-lfastrtps", f"-Wl,--disable-new-dtags,-rpath,{libraries},-rpath-link,{libraries}")
     new.rename(BIN / "fastdds-peer")
 
