@@ -9,7 +9,11 @@ pub mod admin;
 pub mod config;
 mod core_dumps;
 pub mod environment;
+#[cfg(feature = "http")]
+pub mod http;
 pub mod logs;
+#[cfg(feature = "main-service")]
+pub mod main_service;
 mod password;
 mod ready;
 pub mod state;

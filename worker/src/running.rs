@@ -15,6 +15,7 @@ use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, BrokerKind, Health};
 use blaze_domain::InstanceName;
 use blaze_domain::names::ChannelName;
+use blaze_runtime::main_service::MainService;
 use blaze_runtime::{Supervisor, TaskPolicy};
 use bytes::Bytes;
 use tokio::sync::{mpsc, oneshot, watch};
@@ -29,7 +30,7 @@ use crate::lease::{self, Holder, Leadership, Lease};
 use crate::own::{OwnConfig, say_again};
 use crate::serve::{BrokerOutlet, Channels, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
-use crate::sync::{MainService, follow};
+use crate::sync::follow;
 
 /// Copies that may be read late: file and database.
 const COPIES: usize = 2;

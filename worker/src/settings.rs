@@ -7,10 +7,10 @@ use blaze_domain::Scope;
 use blaze_domain::node_file::{
     AutoBool, DatabaseSection, Fault, LayerBroker, NodeBroker, NodeFile, RedisBroker,
 };
+use blaze_runtime::main_service::{MainService, is_this_machine};
 
 use crate::core::Site;
 use crate::core::messages::Delivery;
-use crate::sync::MainService;
 
 /// Which broker services are on.
 #[derive(Debug, Clone, PartialEq)]
@@ -160,20 +160,6 @@ fn reads_nobody_else(redis: &RedisBroker) -> bool {
     match url.strip_prefix("redis://") {
         Some(rest) => is_this_machine(rest),
         None => url.starts_with("redis+unix://") || url.starts_with("unix://"),
-    }
-}
-
-/// Whether what follows `scheme://` in an address is on this machine.
-pub(crate) fn is_this_machine(rest: &str) -> bool {
-    let authority = rest.split(['/', '?', '#']).next().unwrap_or_default();
-    let host = authority.rsplit_once('@').map_or(authority, |(_, host)| host);
-    let host = match host.strip_prefix('[') {
-        Some(rest) => rest.split(']').next().unwrap_or_default(),
-        None => host.split(':').next().unwrap_or_default(),
-    };
-    match host.parse::<std::net::IpAddr>() {
-        Ok(address) => address.to_canonical().is_loopback(),
-        Err(_) => host.eq_ignore_ascii_case("localhost"),
     }
 }
 

@@ -1,32 +1,26 @@
 //! Keeps a stream to the main service open: connects, greets, hands on what comes, says what the
 //! worker has; after an end of any kind it waits and begins anew.
 
-use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use blaze_proto::v1;
 use blaze_proto::v1::sync_request::Msg;
 use blaze_proto::v1::sync_service_client::SyncServiceClient;
+use blaze_runtime::main_service::{self, Backoff, MainService};
 use futures::StreamExt as _;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 use tokio_stream::wrappers::WatchStream;
 use tokio_util::sync::CancellationToken;
 use tonic::metadata::{Ascii, MetadataValue};
-use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
+use tonic::transport::Channel;
 use tonic::{Request, Status, Streaming};
 
-use super::backoff::Backoff;
 use super::wire::IncomingError;
 use crate::core::Incoming;
-use crate::settings::is_this_machine;
 
 /// Largest message that is taken.
 const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
-/// Time for one connection to come about.
-const CONNECT: Duration = Duration::from_millis(1500);
-/// Time for files to be read, a connection to come about and TLS to be agreed upon.
-const REACH: Duration = Duration::from_secs(5);
 /// The main service says something every 15 s; one that is silent for so long is as good as away,
 /// whatever its host answers.
 const SILENCE: Duration = Duration::from_secs(45);
@@ -34,65 +28,17 @@ const SILENCE: Duration = Duration::from_secs(45);
 const GOOD: Duration = Duration::from_secs(10);
 /// Time for the answer to Hello.
 const WELCOME: Duration = Duration::from_secs(10);
-/// Between two looks whether the other end is still there. A cut link loses packets without a word,
-/// and TCP sends again in steps that double: after 30 s the next one comes only 25 s later. So this
-/// end notices by itself, and connects anew.
-const ALIVE: Duration = Duration::from_secs(3);
-/// Time for the answer to such a look.
-const ALIVE_ANSWER: Duration = Duration::from_secs(3);
-/// Token files are small.
-const MAX_TOKEN_BYTES: u64 = 8192;
-/// So are files of authorities, certificates and keys.
-const MAX_PEM_BYTES: u64 = 1024 * 1024;
-
-/// How each part of a file in PEM form begins.
-const PEM: &[u8] = b"-----BEGIN ";
-
-/// Where the main service is and how it knows this worker. Files are read anew for each connection.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct MainService {
-    /// `https://HOST:PORT`, or `http://` on this machine.
-    pub server: String,
-    /// Authorities that are trusted instead of the system's.
-    pub ca_file: Option<PathBuf>,
-    /// File with the token.
-    pub token_file: Option<PathBuf>,
-    /// Files with the own certificate and its key, for a main service that asks for one.
-    pub certificate: Option<(PathBuf, PathBuf)>,
-}
-
-impl MainService {
-    /// Whether nobody else can read what is said: over TLS, or within this machine.
-    #[must_use]
-    pub fn is_safe(&self) -> bool {
-        match self.server.strip_prefix("http://") {
-            Some(rest) => is_this_machine(rest),
-            None => self.server.starts_with("https://"),
-        }
-    }
-}
-
 /// Why there is no stream.
 #[derive(Debug, thiserror::Error)]
-pub enum ConnectError {
-    /// The address is none.
-    #[error("config.server: {0}")]
-    Address(String),
-    /// A file cannot be used.
-    #[error("{key}: {path}: {reason}", path = path.display())]
-    File {
-        /// Key in the node file.
-        key: &'static str,
-        /// Which file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+pub enum StreamError {
+    /// No connection came about.
+    #[error(transparent)]
+    Connect(#[from] main_service::ConnectError),
     /// Nobody answers.
     #[error("no connection: {0}")]
-    Transport(String),
+    Silent(&'static str),
     /// The main service refuses.
-    #[error("refused: {}", words(.0))]
+    #[error("refused: {}", main_service::words(.0))]
     Refused(Status),
     /// What it says makes no sense.
     #[error(transparent)]
@@ -166,7 +112,7 @@ impl Client {
             self.main.borrow_and_update();
             let end = match self.once().await {
                 Ok(end) => end,
-                Err(ConnectError::Ending) => return,
+                Err(StreamError::Ending) => return,
                 Err(error) => End {
                     reason: error.to_string(),
                     is_unreadable: false,
@@ -198,20 +144,14 @@ impl Client {
     }
 
     /// One stream from its beginning to its end.
-    async fn once(&mut self) -> Result<End, ConnectError> {
+    async fn once(&mut self) -> Result<End, StreamError> {
         let main = self.main.borrow().clone();
-        let reached =
-            tokio::time::timeout(REACH, async { Ok((token(&main).await?, channel(&main).await?)) })
-                .await;
-        let (token, channel) = reached.unwrap_or_else(|_| {
-            let reason = format!("no connection within {} s", REACH.as_secs());
-            Err(ConnectError::Transport(reason))
-        })?;
+        let (channel, token) = main.connect().await?;
         let (answer, hello) = oneshot::channel();
         let is_safe = main.is_safe();
         let asked = self.events.send(SyncEvent::Greeting { is_safe, answer }).await;
-        asked.map_err(|_| ConnectError::Ending)?;
-        let hello = hello.await.map_err(|_| ConnectError::Ending)?;
+        asked.map_err(|_| StreamError::Ending)?;
+        let hello = hello.await.map_err(|_| StreamError::Ending)?;
         let stream = self.open(channel, token, hello).await?;
         Ok(self.listen(stream).await)
     }
@@ -221,7 +161,7 @@ impl Client {
         channel: Channel,
         token: Option<MetadataValue<Ascii>>,
         hello: v1::Hello,
-    ) -> Result<Streaming<v1::SyncResponse>, ConnectError> {
+    ) -> Result<Streaming<v1::SyncResponse>, StreamError> {
         // What the last stream said is nothing to this one until the engine says it again.
         let mut acks = self.acks.clone();
         acks.mark_unchanged();
@@ -236,8 +176,8 @@ impl Client {
             SyncServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE_BYTES);
         match tokio::time::timeout(WELCOME, client.sync(request)).await {
             Ok(Ok(response)) => Ok(response.into_inner()),
-            Ok(Err(status)) => Err(ConnectError::Refused(status)),
-            Err(_) => Err(ConnectError::Transport("no answer to Hello within 10 s".to_owned())),
+            Ok(Err(status)) => Err(StreamError::Refused(status)),
+            Err(_) => Err(StreamError::Silent("no answer to Hello within 10 s")),
         }
     }
 
@@ -287,7 +227,7 @@ impl Client {
                 Err(status) => {
                     // The library's word for a message that is too large.
                     is_unreadable = status.code() == tonic::Code::OutOfRange;
-                    break ConnectError::Refused(status).to_string();
+                    break StreamError::Refused(status).to_string();
                 }
             }
         };
@@ -297,120 +237,6 @@ impl Client {
             was_good: began.elapsed() >= GOOD,
             again,
             contact: Some(contact),
-        }
-    }
-}
-
-async fn token(main: &MainService) -> Result<Option<MetadataValue<Ascii>>, ConnectError> {
-    let Some(path) = &main.token_file else { return Ok(None) };
-    let refuse = |reason: String| ConnectError::File {
-        key: "config.token_file",
-        path: path.clone(),
-        reason,
-    };
-    let text = read(path, MAX_TOKEN_BYTES).await.map_err(&refuse)?;
-    let text = String::from_utf8(text).map_err(|_| refuse("it is no text".to_owned()))?;
-    let mut value: MetadataValue<Ascii> = format!("Bearer {}", text.trim())
-        .parse()
-        .map_err(|_| refuse("it holds no token".to_owned()))?;
-    value.set_sensitive(true);
-    Ok(Some(value))
-}
-
-async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
-    let endpoint = Endpoint::from_shared(main.server.clone())
-        .map_err(|error| ConnectError::Address(error.to_string()))?;
-    let endpoint = endpoint
-        .connect_timeout(CONNECT)
-        .tcp_nodelay(true)
-        .http2_keep_alive_interval(ALIVE)
-        .keep_alive_timeout(ALIVE_ANSWER)
-        .keep_alive_while_idle(true);
-    let endpoint = match main.server.starts_with("https://") {
-        false => endpoint,
-        true => {
-            let tls = ClientTlsConfig::new().timeout(CONNECT);
-            let tls = match &main.ca_file {
-                None => tls.with_native_roots(),
-                Some(path) => {
-                    tls.ca_certificate(Certificate::from_pem(pem("config.ca_file", path).await?))
-                }
-            };
-            let tls = match &main.certificate {
-                None => tls,
-                Some((certificate, key)) => {
-                    let certificate = pem("config.cert_file", certificate).await?;
-                    tls.identity(Identity::from_pem(
-                        certificate,
-                        pem("config.key_file", key).await?,
-                    ))
-                }
-            };
-            endpoint.tls_config(tls).map_err(|error| ConnectError::Transport(chain(&error)))?
-        }
-    };
-    endpoint.connect().await.map_err(|error| ConnectError::Transport(chain(&error)))
-}
-
-/// What a file in PEM form holds; `key` names it in the node file.
-async fn pem(key: &'static str, path: &Path) -> Result<Vec<u8>, ConnectError> {
-    let refuse = |reason| ConnectError::File { key, path: path.to_owned(), reason };
-    let text = read(path, MAX_PEM_BYTES).await.map_err(refuse)?;
-    // The library takes a file without any for one with none, and then only the other end says that
-    // something is missing.
-    let has_some = text.windows(PEM.len()).any(|start| start == PEM);
-    has_some.then_some(text).ok_or_else(|| refuse("it holds nothing in PEM form".to_owned()))
-}
-
-/// What a refusal says, with what caused it where the connection broke.
-fn words(status: &Status) -> String {
-    let cause = std::error::Error::source(status).map(chain);
-    let text = match cause {
-        Some(cause) => format!("{} ({:?}): {cause}", status.message(), status.code()),
-        None => format!("{} ({:?})", status.message(), status.code()),
-    };
-    // As TLS names it. It comes after the connection does, in answer to the first call.
-    match text.contains("CertificateRequired") {
-        true => format!(
-            "the main service asks for a client certificate: name it with config.cert_file and \
-             config.key_file [{text}]"
-        ),
-        false => text,
-    }
-}
-
-/// The library's errors say little; what caused them says more.
-fn chain(error: &(dyn std::error::Error + 'static)) -> String {
-    let causes: Vec<String> = anyhow::Chain::new(error).map(ToString::to_string).collect();
-    causes.join(": ")
-}
-
-async fn read(path: &Path, most: u64) -> Result<Vec<u8>, String> {
-    let bytes = tokio::fs::read(path).await.map_err(|error| error.to_string())?;
-    if bytes.len() as u64 > most {
-        return Err(format!("it has {} bytes, at most {most} are read", bytes.len()));
-    }
-    Ok(bytes)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_tls_and_this_machine_are_safe() {
-        for (server, is_safe) in [
-            ("https://config.example.org:50051", true),
-            ("http://127.0.0.1:50051", true),
-            ("http://[::1]:50051", true),
-            ("http://localhost", true),
-            ("http://10.0.3.1:50051", false),
-            ("http://localhost.example.org", false),
-            ("http://127.0.0.1@evil.example.org", false),
-            ("ftp://127.0.0.1", false),
-        ] {
-            let main = MainService { server: server.to_owned(), ..MainService::default() };
-            assert_eq!(main.is_safe(), is_safe, "{server}");
         }
     }
 }

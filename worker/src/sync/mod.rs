@@ -5,8 +5,7 @@
 //!        ──Hello──▶ main service ──Welcome, Snapshot, Commit, Bookmark──▶ client ──[Incoming]──▶ engine ──[Ack]──▶ client
 //! ```
 
-pub mod backoff;
 pub mod client;
 pub mod wire;
 
-pub use client::{ConnectError, MainService, SyncEvent, follow};
+pub use client::{StreamError, SyncEvent, follow};
