@@ -176,6 +176,11 @@ impl ControlCore {
         self.topic_states.counts()
     }
 
+    /// Topics that are in a state, by its name in answers.
+    pub fn topics_in_state(&self, state: &str) -> impl Iterator<Item = &TopicName> {
+        self.topic_states.in_state(state)
+    }
+
     /// What the flow says of itself.
     #[must_use]
     pub fn state(&self) -> FlowState {

@@ -71,6 +71,11 @@ impl TopicStates {
         }
     }
 
+    /// Topics that are in a state, by its name in answers.
+    pub(super) fn in_state(&self, state: &str) -> impl Iterator<Item = &TopicName> {
+        self.by_topic.iter().filter(move |(_, at)| at.as_str() == state).map(|(topic, _)| topic)
+    }
+
     /// Topics by state, without states that no topic has.
     pub(super) fn counts(&self) -> impl Iterator<Item = (TopicState, u64)> {
         self.counts.iter().map(|(state, count)| (*state, *count)).filter(|(_, count)| *count > 0)
@@ -96,5 +101,7 @@ mod tests {
             states.set(topic, state);
         }
         assert_eq!(states.counts().collect::<Vec<_>>(), [(TopicState::Flowing, 1)]);
+        assert_eq!(states.in_state("flowing").collect::<Vec<_>>(), [&a]);
+        assert_eq!(states.in_state("no_request").count(), 0);
     }
 }

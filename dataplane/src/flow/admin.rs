@@ -32,10 +32,11 @@ use crate::world::{Advertise, Request};
 
 type App = State<Arc<Shared>>;
 
-/// The topic that a question is about; without one it is about all.
+/// What a question is about: one topic, those in a state, or all.
 #[derive(serde::Deserialize)]
 struct Asked {
     topic: Option<String>,
+    state: Option<String>,
 }
 
 impl Asked {
@@ -93,9 +94,10 @@ async fn topics(State(shared): App, Query(asked): Query<Asked>) -> Json<Value> {
     let registry = control.registry();
     let no_plan = TopicPlan::default();
     let mut rows = Vec::new();
-    let topics = match &asked.topic {
-        Some(topic) => topic.parse().into_iter().collect(),
-        None => registry.all_topics(),
+    let topics: Vec<TopicName> = match (&asked.topic, &asked.state) {
+        (Some(topic), _) => topic.parse().into_iter().collect(),
+        (None, Some(state)) => control.topics_in_state(state).cloned().collect(),
+        (None, None) => registry.all_topics().into_iter().collect(),
     };
     for topic in topics {
         let mut advertised: Vec<Value> = Vec::new();

@@ -1,0 +1,284 @@
+//! What the flows and the worker of this node say on their admin ports.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+
+use blaze_domain::{FlowId, LayerName};
+use blaze_runtime::http::{GetLimits, get};
+use futures::StreamExt as _;
+use serde_json::Value;
+
+use crate::limits::{ANSWER, MAX_BLOCKED, MAX_FLOWS};
+
+/// Questions at a time.
+const AT_ONCE: usize = 8;
+
+/// What a flow says.
+#[derive(Debug, Clone, Default)]
+pub struct FlowView {
+    /// Where it is asked.
+    pub address: String,
+    /// Its name, once it has answered.
+    pub name: Option<FlowId>,
+    /// Its answer to `/v1/summary`; `None`: it does not answer.
+    pub summary: Option<Value>,
+    /// Why it does not answer.
+    pub away: String,
+    /// Rows of `/v1/peers`, some seconds old.
+    pub peers: Vec<Value>,
+    /// Rows of `/v1/bridges`, some seconds old.
+    pub bridges: Vec<Value>,
+    /// Rows of `/v1/topics` of those that flow, some seconds old.
+    pub topics: Vec<Value>,
+    /// Answers to `/v1/why` about topics that are blocked, some seconds old.
+    pub blocked: Vec<Value>,
+}
+
+impl FlowView {
+    /// Whether it is ready.
+    #[must_use]
+    pub fn is_ready(&self) -> bool {
+        self.summary.as_ref().is_some_and(|summary| summary["state"] == "ready")
+    }
+}
+
+/// What the worker says.
+#[derive(Debug, Clone, Default)]
+pub struct WorkerView {
+    /// Its answer to `/v1/status`; `None`: it does not answer.
+    pub status: Option<Value>,
+    /// Whether `/readyz` says ready.
+    pub is_ready: bool,
+    /// Why it is not ready, or does not answer.
+    pub detail: String,
+}
+
+/// The programs of this node.
+#[derive(Debug, Clone, Default)]
+pub struct Programs {
+    /// In the order of `monitor.flows`.
+    pub flows: Vec<FlowView>,
+    /// The worker.
+    pub worker: WorkerView,
+}
+
+impl Programs {
+    /// Asks all of them. `before` is the last answer: what is asked more rarely is taken from it
+    /// unless `is_closer`.
+    pub async fn look(flows: &[String], worker: &str, before: &Self, is_closer: bool) -> Self {
+        let addresses = addresses(flows).await;
+        let flows = futures::stream::iter(addresses)
+            .map(|address| {
+                let known = before.flows.iter().find(|flow| flow.address == address);
+                look_at_flow(address, known, is_closer)
+            })
+            .buffered(AT_ONCE);
+        let (flows, worker) = tokio::join!(flows.collect::<Vec<_>>(), look_at_worker(worker));
+        Self { flows, worker }
+    }
+
+    /// Layers that a flow here knows, with their own ones.
+    #[must_use]
+    pub fn layers(&self) -> BTreeSet<LayerName> {
+        let peers = self.flows.iter().flat_map(|flow| &flow.peers);
+        let of_peers = peers.filter_map(|peer| peer["layer"].as_str()?.parse().ok());
+        let own = self.flows.iter().filter_map(|flow| flow.name.as_ref());
+        of_peers.chain(own.map(|name| name.layer.clone())).collect()
+    }
+}
+
+/// One address for each of a name.
+async fn addresses(flows: &[String]) -> Vec<String> {
+    let mut out: Vec<String> = Vec::new();
+    for flow in flows {
+        let found: Vec<SocketAddr> = match flow.parse::<SocketAddr>() {
+            Ok(address) => vec![address],
+            Err(_) => match tokio::net::lookup_host(flow.as_str()).await {
+                Ok(found) => found.collect(),
+                Err(_) => Vec::new(),
+            },
+        };
+        match found.is_empty() {
+            true => out.push(flow.clone()),
+            false => out.extend(found.iter().map(ToString::to_string)),
+        }
+    }
+    let mut seen = BTreeSet::new();
+    out.retain(|address| seen.insert(address.clone()));
+    out.truncate(MAX_FLOWS);
+    out
+}
+
+async fn look_at_flow(address: String, before: Option<&FlowView>, is_closer: bool) -> FlowView {
+    let before = before.cloned().unwrap_or_default();
+    let summary = match json(&address, "/v1/summary", ANSWER).await {
+        Ok(summary) => summary,
+        Err(away) => return FlowView { address, name: before.name, away, ..FlowView::default() },
+    };
+    let name = summary["flow"].as_str().and_then(|name| name.parse().ok());
+    if !is_closer {
+        let away = String::new();
+        return FlowView { address, name, summary: Some(summary), away, ..before };
+    }
+    let is_blocked = summary["topics"]["blocked"].as_u64().unwrap_or(0) > 0;
+    let (peers, bridges, topics, blocked) = tokio::join!(
+        rows(&address, "/v1/peers", "peers"),
+        rows(&address, "/v1/bridges", "bridges"),
+        rows(&address, "/v1/topics?state=flowing", "topics"),
+        async {
+            match is_blocked {
+                true => blocked(&address).await,
+                false => Vec::new(),
+            }
+        }
+    );
+    FlowView {
+        address,
+        name,
+        summary: Some(summary),
+        away: String::new(),
+        peers,
+        bridges,
+        topics,
+        blocked,
+    }
+}
+
+/// Why the topics that are blocked do not flow, of the first ones.
+async fn blocked(address: &str) -> Vec<Value> {
+    let topics = rows(address, "/v1/topics?state=blocked", "topics").await;
+    let names = topics.iter().filter(|row| row["state"] == "blocked");
+    let names: Vec<&str> = names.filter_map(|row| row["topic"].as_str()).take(MAX_BLOCKED).collect();
+    futures::stream::iter(names)
+        .map(|topic| async move {
+            json(address, &format!("/v1/why?topic={topic}"), ANSWER).await.ok()
+        })
+        .buffered(AT_ONCE)
+        .filter_map(|why| async { why })
+        .collect()
+        .await
+}
+
+async fn look_at_worker(address: &str) -> WorkerView {
+    let (ready, status) =
+        tokio::join!(get(address, "/readyz", ANSWER), json(address, "/v1/status", ANSWER));
+    match ready {
+        Ok((code, body)) => WorkerView {
+            status: status.ok(),
+            is_ready: code == 200,
+            detail: match code {
+                200 => String::new(),
+                _ => failed_checks(&body),
+            },
+        },
+        Err(error) => WorkerView { detail: error.to_string(), ..WorkerView::default() },
+    }
+}
+
+/// The checks of `/readyz` that failed, for people.
+fn failed_checks(body: &[u8]) -> String {
+    let report: Value = serde_json::from_slice(body).unwrap_or_default();
+    let checks = report["checks"].as_object().into_iter().flatten();
+    let failed = checks.filter(|(_, check)| check["status"] == "failed");
+    let words: Vec<String> = failed
+        .map(|(name, check)| format!("{name}: {}", check["detail"].as_str().unwrap_or_default()))
+        .collect();
+    words.join("; ")
+}
+
+/// Nodes whose monitors request the pings of a layer, as a flow knows them.
+pub async fn ping_requesters(address: &str, layers: &BTreeSet<LayerName>) -> BTreeSet<FlowId> {
+    let mut out = BTreeSet::new();
+    for layer in layers {
+        let path = format!("/v1/topics?topic=blaze/ping/{layer}");
+        for topic in rows(address, &path, "topics").await {
+            out.extend(requesters(layer, &topic));
+        }
+    }
+    out
+}
+
+/// The nodes of a layer that request a topic, of its row in `/v1/topics`.
+fn requesters(layer: &LayerName, topic: &Value) -> Vec<FlowId> {
+    let requested = topic["requested"].as_array().into_iter().flatten();
+    let rows = requested.filter(|row| row["layer"] == layer.as_str());
+    let names = rows.flat_map(|row| {
+        let services = row["services"].as_array().into_iter().flatten();
+        services.map(|service| &service["node"]).chain([&row["node"]])
+    });
+    names
+        .filter_map(Value::as_str)
+        .filter_map(|node| Some(FlowId::new(layer.clone(), node.parse().ok()?)))
+        .collect()
+}
+
+/// Offsets of the clocks of the other flows, as a flow knows them: seconds, with their errors.
+#[must_use]
+pub fn link_offsets(peers: &[Value]) -> BTreeMap<FlowId, (f64, f64)> {
+    peers
+        .iter()
+        .filter(|peer| peer["state"] == "up")
+        .filter_map(|peer| {
+            let flow = peer["flow"].as_str()?.parse().ok()?;
+            let offset = peer["clock_offset_ms"].as_f64()? / 1e3;
+            Some((flow, (offset, peer["clock_error_ms"].as_f64()? / 1e3)))
+        })
+        .collect()
+}
+
+async fn rows(address: &str, path: &str, member: &str) -> Vec<Value> {
+    match json(address, path, ANSWER).await {
+        Ok(mut body) => match body[member].take() {
+            Value::Array(rows) => rows,
+            _ => Vec::new(),
+        },
+        Err(error) => {
+            tracing::debug!(address, path, error, "no answer");
+            Vec::new()
+        }
+    }
+}
+
+/// The JSON object that `path` answers with.
+async fn json(address: &str, path: &str, limits: GetLimits) -> Result<Value, String> {
+    let (status, body) =
+        get(address, path, limits).await.map_err(|error| format!("{address}: {error}"))?;
+    if status != 200 {
+        return Err(format!("{address}: status {status}"));
+    }
+    serde_json::from_slice(&body).map_err(|error| format!("{address}: no JSON: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn requesters_are_found_among_merged_services_and_own_leases() {
+        let topic = json!({"topic": "blaze/ping/edge", "requested": [
+            {"layer": "edge", "node": "robot-1", "service": "blaze-monitor"},
+            {"layer": "edge", "node": "", "service": "", "flow": "edge/robot-2",
+             "services": [{"node": "robot-2", "service": "blaze-monitor"},
+                          {"node": "Not a name!", "service": "x"}]},
+            {"layer": "fog", "node": "fog-1", "service": "blaze-monitor"},
+        ]});
+        let found = requesters(&"edge".parse().unwrap(), &topic);
+        let names: Vec<String> = found.iter().map(ToString::to_string).collect();
+        assert_eq!(names, ["edge/robot-1", "edge/robot-2"]);
+    }
+
+    #[test]
+    fn only_links_that_are_up_give_an_offset() {
+        let peer = |flow: &str, state: &str, offset: Value| {
+            json!({"flow": flow, "state": state, "clock_offset_ms": offset, "clock_error_ms": 2.0})
+        };
+        let offsets = link_offsets(&[
+            peer("fog/fog-1", "up", json!(-3000.0)),
+            peer("fog/fog-2", "down", json!(1.0)),
+            peer("fog/fog-3", "up", Value::Null),
+        ]);
+        assert_eq!(offsets, [("fog/fog-1".parse().unwrap(), (-3.0, 0.002))].into());
+    }
+}
