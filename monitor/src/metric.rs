@@ -119,6 +119,7 @@ pub enum Value<'a> {
 #[derive(Debug, Default)]
 pub struct Page {
     families: BTreeMap<&'static str, MetricFamily>,
+    more: Vec<MetricFamily>,
 }
 
 impl Page {
@@ -153,10 +154,15 @@ impl Page {
         family.mut_metric().push(row);
     }
 
+    /// Adds whole families.
+    pub fn extend(&mut self, families: impl IntoIterator<Item = MetricFamily>) {
+        self.more.extend(families);
+    }
+
     /// The text.
     #[must_use]
     pub fn text(self) -> String {
-        let families: Vec<MetricFamily> = self.families.into_values().collect();
+        let families: Vec<MetricFamily> = self.families.into_values().chain(self.more).collect();
         let mut text = Vec::new();
         if let Err(error) = TextEncoder::new().encode(&families, &mut text) {
             tracing::error!(%error, "metrics");

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use blaze_domain::{FlowId, Priority, TopicName};
 use blaze_sdk::{
     Advertise, FlowManager, LocalBroker, Message, PublishOptions, Publisher, Request,
-    ServiceManager, SubscribeOptions,
+    SubscribeOptions,
 };
 use parking_lot::Mutex;
 use tokio::sync::Notify;
@@ -123,9 +123,8 @@ impl<F: FnMut()> Drop for Cancel<F> {
     }
 }
 
-/// Pings through the broker of a service, for ever.
-pub async fn run(pings: Arc<Pings>, service: &ServiceManager) {
-    let (broker, flow) = (service.broker().clone(), service.flow().clone());
+/// Pings through a broker, for ever.
+pub async fn run(pings: Arc<Pings>, broker: LocalBroker, flow: FlowManager) {
     let mut requested: BTreeMap<TopicName, AbortOnDropHandle<()>> = BTreeMap::new();
     let mut advertised: BTreeMap<TopicName, Advertised> = BTreeMap::new();
     loop {
@@ -221,7 +220,7 @@ async fn request(pings: Arc<Pings>, broker: LocalBroker, flow: FlowManager, topi
 }
 
 /// Tries again until a flow agrees. A monitor without a flow pings those on its broker.
-async fn until_held<F>(ask: impl Fn() -> F) -> blaze_sdk::Lease
+pub(crate) async fn until_held<F>(ask: impl Fn() -> F) -> blaze_sdk::Lease
 where
     F: Future<Output = Result<blaze_sdk::Lease, blaze_sdk::FlowError>>,
 {

@@ -22,8 +22,10 @@ pub struct FlowView {
     pub name: Option<FlowId>,
     /// Its answer to `/v1/summary`; `None`: it does not answer.
     pub summary: Option<Value>,
-    /// Why it does not answer.
+    /// Why it does not answer, or is not ready.
     pub away: String,
+    /// Fault of its configuration, with which it goes on as before.
+    pub config_fault: Option<String>,
     /// Rows of `/v1/peers`, some seconds old.
     pub peers: Vec<Value>,
     /// Rows of `/v1/bridges`, some seconds old.
@@ -47,8 +49,12 @@ impl FlowView {
 pub struct WorkerView {
     /// Its answer to `/v1/status`; `None`: it does not answer.
     pub status: Option<Value>,
+    /// Whether it answers at all.
+    pub is_reachable: bool,
     /// Whether `/readyz` says ready.
     pub is_ready: bool,
+    /// Fault of its configuration, with which it goes on as before.
+    pub config_fault: Option<String>,
     /// Why it is not ready, or does not answer.
     pub detail: String,
 }
@@ -111,14 +117,22 @@ async fn addresses(flows: &[String]) -> Vec<String> {
 
 async fn look_at_flow(address: String, before: Option<&FlowView>, is_closer: bool) -> FlowView {
     let before = before.cloned().unwrap_or_default();
-    let summary = match json(&address, "/v1/summary", ANSWER).await {
+    let (summary, ready) =
+        tokio::join!(json(&address, "/v1/summary", ANSWER), readiness(&address));
+    let summary = match summary {
         Ok(summary) => summary,
         Err(away) => return FlowView { address, name: before.name, away, ..FlowView::default() },
     };
     let name = summary["flow"].as_str().and_then(|name| name.parse().ok());
+    let view = FlowView {
+        name,
+        away: ready.detail,
+        config_fault: ready.config_fault,
+        address: address.clone(),
+        ..before
+    };
     if !is_closer {
-        let away = String::new();
-        return FlowView { address, name, summary: Some(summary), away, ..before };
+        return FlowView { summary: Some(summary), ..view };
     }
     let is_blocked = summary["topics"]["blocked"].as_u64().unwrap_or(0) > 0;
     let (peers, bridges, topics, blocked) = tokio::join!(
@@ -132,16 +146,7 @@ async fn look_at_flow(address: String, before: Option<&FlowView>, is_closer: boo
             }
         }
     );
-    FlowView {
-        address,
-        name,
-        summary: Some(summary),
-        away: String::new(),
-        peers,
-        bridges,
-        topics,
-        blocked,
-    }
+    FlowView { summary: Some(summary), peers, bridges, topics, blocked, ..view }
 }
 
 /// Why the topics that are blocked do not flow, of the first ones.
@@ -160,30 +165,44 @@ async fn blocked(address: &str) -> Vec<Value> {
 }
 
 async fn look_at_worker(address: &str) -> WorkerView {
-    let (ready, status) =
-        tokio::join!(get(address, "/readyz", ANSWER), json(address, "/v1/status", ANSWER));
-    match ready {
-        Ok((code, body)) => WorkerView {
-            status: status.ok(),
-            is_ready: code == 200,
-            detail: match code {
-                200 => String::new(),
-                _ => failed_checks(&body),
-            },
-        },
-        Err(error) => WorkerView { detail: error.to_string(), ..WorkerView::default() },
+    let (ready, status) = tokio::join!(readiness(address), json(address, "/v1/status", ANSWER));
+    WorkerView {
+        status: status.ok(),
+        is_reachable: ready.is_reachable,
+        is_ready: ready.is_ready,
+        config_fault: ready.config_fault,
+        detail: ready.detail,
     }
 }
 
-/// The checks of `/readyz` that failed, for people.
-fn failed_checks(body: &[u8]) -> String {
+/// What `/readyz` of a program says.
+#[derive(Debug, Default, PartialEq)]
+struct Ready {
+    is_reachable: bool,
+    is_ready: bool,
+    /// Checks that fail, or why it does not answer; empty while it is ready.
+    detail: String,
+    config_fault: Option<String>,
+}
+
+async fn readiness(address: &str) -> Ready {
+    match get(address, "/readyz", ANSWER).await {
+        Ok((code, body)) => ready(code == 200, &body),
+        Err(error) => Ready { detail: format!("{address}: {error}"), ..Ready::default() },
+    }
+}
+
+fn ready(is_ready: bool, body: &[u8]) -> Ready {
     let report: Value = serde_json::from_slice(body).unwrap_or_default();
     let checks = report["checks"].as_object().into_iter().flatten();
     let failed = checks.filter(|(_, check)| check["status"] == "failed");
-    let words: Vec<String> = failed
-        .map(|(name, check)| format!("{name}: {}", check["detail"].as_str().unwrap_or_default()))
-        .collect();
-    words.join("; ")
+    let detail = |check: &Value| check["detail"].as_str().unwrap_or_default().to_owned();
+    let config_fault =
+        failed.clone().find(|(name, _)| *name == "config").map(|(_, check)| detail(check));
+    let words: Vec<String> =
+        failed.map(|(name, check)| format!("{name}: {}", detail(check))).collect();
+    let detail = if is_ready { String::new() } else { words.join("; ") };
+    Ready { is_reachable: true, is_ready, detail, config_fault }
 }
 
 /// Nodes whose monitors request the pings of a layer, as a flow knows them.
@@ -267,6 +286,22 @@ mod tests {
         let found = requesters(&"edge".parse().unwrap(), &topic);
         let names: Vec<String> = found.iter().map(ToString::to_string).collect();
         assert_eq!(names, ["edge/robot-1", "edge/robot-2"]);
+    }
+
+    #[test]
+    fn readiness_names_the_checks_that_fail_and_a_fault_of_the_configuration() {
+        let checks = json!({"checks": {
+            "config": {"status": "failed", "detail": "blaze.yaml:3: no"},
+            "inter": {"status": "failed", "detail": "no interface"},
+            "node_broker": {"status": "ok", "detail": "redis"},
+        }});
+        let body = checks.to_string();
+        let not_ready = ready(false, body.as_bytes());
+        assert_eq!(not_ready.detail, "config: blaze.yaml:3: no; inter: no interface");
+        let is_ready = ready(true, body.as_bytes());
+        assert_eq!(is_ready.detail, "");
+        assert_eq!(is_ready.config_fault.as_deref(), Some("blaze.yaml:3: no"));
+        assert_eq!(ready(true, b"no json"), Ready { is_reachable: true, is_ready: true, ..Ready::default() });
     }
 
     #[test]

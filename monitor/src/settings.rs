@@ -2,8 +2,8 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
-use blaze_domain::node_file::{Fault, LayerBroker, MonitorSection, NodeBroker, NodeFile};
 use blaze_domain::FlowId;
+use blaze_domain::node_file::{Fault, MonitorSection, NodeBroker, NodeFile};
 use blaze_runtime::main_service::MainService;
 
 /// What a monitor takes over while it runs.
@@ -17,6 +17,8 @@ pub struct LiveSettings {
     pub worker: String,
     /// Where it reports; `None`: nowhere.
     pub main: Option<MainService>,
+    /// Programs that belong to this node.
+    pub expected: Expected,
 }
 
 impl LiveSettings {
@@ -34,7 +36,8 @@ impl LiveSettings {
             token_file: config.token_file.clone(),
             certificate: config.cert_file.clone().zip(config.key_file.clone()),
         });
-        Self { section, flows, worker: reached(file.admin.worker).to_string(), main }
+        let worker = reached(file.admin.worker).to_string();
+        Self { section, flows, worker, main, expected: Expected::of(file) }
     }
 }
 
@@ -78,16 +81,6 @@ impl Expected {
             flow: is_alone || file.brokers.inter.is_some() || !file.monitor.flows.is_empty(),
             worker: is_alone && file.config.is_some(),
         }
-    }
-}
-
-/// Whether the node has a broker that other programs are on as well.
-#[must_use]
-pub fn has_broker(file: &NodeFile) -> bool {
-    match (&file.brokers.node, &file.brokers.layer) {
-        (Some(NodeBroker::Redis(_)), _) => true,
-        (_, Some(LayerBroker::Dds(_) | LayerBroker::Kafka(_))) => true,
-        (Some(NodeBroker::Memory) | None, Some(LayerBroker::Memory) | None) => false,
     }
 }
 

@@ -11,6 +11,7 @@ mod tests;
 
 use std::io;
 use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -29,6 +30,9 @@ use crate::supervisor::{Supervisor, TaskHandle, TaskPolicy, say};
 
 /// Gives the metrics in the text format of Prometheus.
 pub type MetricsText = Arc<dyn Fn() -> String + Send + Sync>;
+
+/// Makes of the program's own page of metrics the one with `?all=1`.
+pub type AllMetrics = Arc<dyn Fn(String) -> Pin<Box<dyn Future<Output = String> + Send>> + Send + Sync>;
 
 /// What the port allows.
 #[derive(Debug, Clone)]
@@ -141,6 +145,13 @@ impl AdminServer {
         let router =
             routes::router(extra, readiness, metrics, Arc::clone(&counters), limits.body_bytes);
         Ok(Self { listener, address, router, limits, counters })
+    }
+
+    /// Answers `/metrics?all=1` with what `all` makes of the program's own page.
+    #[must_use]
+    pub fn all_metrics(mut self, all: AllMetrics) -> Self {
+        self.router = routes::with_all_metrics(self.router, all);
+        self
     }
 
     /// The address with the real port.

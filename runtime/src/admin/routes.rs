@@ -2,15 +2,16 @@
 
 use std::sync::Arc;
 
-use axum::extract::DefaultBodyLimit;
+use axum::extract::{DefaultBodyLimit, Request};
 use axum::http::{HeaderValue, Method, StatusCode, Uri, header};
+use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use serde_json::json;
 
 use super::readiness::{Readiness, ReadinessStatus};
-use super::{Counters, MetricsText};
+use super::{AllMetrics, Counters, MetricsText};
 
 /// All routes: the three of every program, its own, and what answers the rest.
 pub(super) fn router(
@@ -38,6 +39,26 @@ pub(super) fn router(
             error(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", &detail)
         })
         .layer(DefaultBodyLimit::max(body_bytes))
+}
+
+/// The routes, with another page of metrics for `/metrics?all=1`.
+pub(super) fn with_all_metrics(router: Router, all: AllMetrics) -> Router {
+    router.layer(middleware::from_fn(move |request: Request, next: Next| {
+        let asks_for_all = request.uri().path() == "/metrics"
+            && request.uri().query().is_some_and(|query| query.split('&').any(|one| one == "all=1"));
+        let all = Arc::clone(&all);
+        async move {
+            let response = next.run(request).await;
+            if !asks_for_all {
+                return response;
+            }
+            let (mut head, body) = response.into_parts();
+            head.headers.remove(header::CONTENT_LENGTH);
+            let own = axum::body::to_bytes(body, usize::MAX).await.unwrap_or_default();
+            let page = all(String::from_utf8_lossy(&own).into_owned()).await;
+            Response::from_parts(head, page.into())
+        }
+    }))
 }
 
 fn readyz(readiness: &Readiness) -> Response {
