@@ -98,9 +98,7 @@ fn the_example_is_read_whole() {
     assert_eq!(file.flow.bandwidth.link_limit_bytes_per_s(&cloud), Some(40.0 * 131_072.0));
     assert_eq!(file.state_dir.as_deref(), Some(std::path::Path::new("/var/lib/blaze")));
     assert!(file.check_for_flow().is_empty());
-    let places: Vec<&str> = warnings.iter().map(|warning| warning.path.as_str()).collect();
-    assert_eq!(places, ["monitor", "admin"]);
-    assert_eq!(warnings[1].detail, "monitor: not in effect in this version");
+    assert!(warnings.is_empty(), "{warnings:?}");
 }
 
 #[test]
