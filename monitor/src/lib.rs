@@ -3,5 +3,6 @@
 
 pub mod health;
 pub mod latency;
+pub mod metric;
 pub mod node;
 pub mod ping;
