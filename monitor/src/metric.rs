@@ -6,7 +6,7 @@ use prometheus::proto::{
     Bucket, Counter, Gauge, Histogram as ProtoHistogram, LabelPair, Metric as Row, MetricFamily,
     MetricType,
 };
-use prometheus::{Encoder as _, TextEncoder};
+use prometheus::{Encoder as _, Opts, TextEncoder};
 
 /// Kind of a metric in the sense of Prometheus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +44,14 @@ pub struct Metric {
     pub help: &'static str,
     /// Names of the labels, in the order of a series' values.
     pub labels: &'static [&'static str],
+}
+
+impl Metric {
+    /// Name and help in the form of the crate `prometheus`.
+    #[must_use]
+    pub fn opts(&self) -> Opts {
+        Opts::new(self.name, self.help)
+    }
 }
 
 /// Declares the metrics of a module and the table `METRICS` of them.

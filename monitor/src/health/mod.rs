@@ -34,20 +34,16 @@ pub use inputs::{
     TopicInput, Vitals,
 };
 
-use crate::metric::{Kind, Metric};
+use crate::metric::metrics;
 use conditions::Finder;
 use limits::MAX_LABELS;
 use services::Services;
 use tracker::{Standing, Tracker};
 
-const HEALTH: Metric = Metric {
-    name: "blaze_health",
-    kind: Kind::Gauge,
-    help: "1 for the present state of the node or service, 0 for the others",
-    labels: &["scope", "name", "state"],
-};
-/// Metrics of health.
-pub static METRICS: &[Metric] = &[HEALTH];
+metrics! {
+    HEALTH Gauge "blaze_health" ["scope", "name", "state"] "1"
+        "1 for the present state of the node or service, 0 for the others."
+}
 /// Label of what is beyond the bound of labels.
 const OTHER: &str = "_other";
 

@@ -29,32 +29,19 @@ pub use flows::{Bridge, Count, End, FlowFigures, Hop, Quantiles};
 pub use measure::{Measured, Message, Method, Offset, Outcome};
 pub use stamp::{header_stamp_cdr, header_stamp_json};
 
-use crate::metric::{Kind, Metric};
+use crate::metric::metrics;
 use flows::{Path, rounded};
 use limits::{BUCKETS, MAX_PAIRS, MAX_SAMPLES};
 use rows::{Key, Row, Rows, Writers};
 
-const SECONDS: Metric = Metric {
-    name: "blaze_message_latency_seconds",
-    kind: Kind::Histogram,
-    help: "Latency of messages that the monitor subscribes to, by the clocks or by their age",
-    labels: &["topic", "from_layer", "from_node", "method"],
-};
-const ERROR: Metric = Metric {
-    name: "blaze_message_latency_error_seconds",
-    kind: Kind::Gauge,
-    help: "Bound of the error of the latency of the last messages",
-    labels: &["topic", "from_layer", "from_node"],
-};
-const UNKNOWN: Metric = Metric {
-    name: "blaze_message_latency_unknown_total",
-    kind: Kind::Counter,
-    help: "Messages without an age whose latency the clocks are not good enough for",
-    labels: &["topic", "from_layer", "from_node"],
-};
-/// Metrics of message latency. Topics that are observed passively have no histogram here: it is
-/// `blaze_flow_delivery_age_seconds` of their flow.
-pub static METRICS: &[Metric] = &[SECONDS, ERROR, UNKNOWN];
+metrics! {
+    SECONDS Histogram "blaze_message_latency_seconds" ["topic", "from_layer", "from_node", "method"] "seconds"
+        "Latency of messages that the monitor subscribes to, by the clocks or by their age."
+    ERROR Gauge "blaze_message_latency_error_seconds" ["topic", "from_layer", "from_node"] "seconds"
+        "Bound of the error of the latency of the last messages."
+    UNKNOWN Counter "blaze_message_latency_unknown_total" ["topic", "from_layer", "from_node"] "1"
+        "Messages without an age whose latency the clocks are not good enough for."
+}
 
 /// `/v1/latency`, without the members of every answer.
 #[derive(Debug, Clone, PartialEq, Serialize)]

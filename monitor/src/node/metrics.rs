@@ -1,49 +1,6 @@
-//! The table of the metrics: names, kinds, units, labels, and what they mean.
+//! The table of the metrics of the node.
 
-/// Kind of a metric in the sense of Prometheus.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
-    /// Grows, or starts again at the restart of its source.
-    Counter,
-    /// Goes up and down.
-    Gauge,
-}
-
-impl Kind {
-    /// The word of the exposition format.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Counter => "counter",
-            Self::Gauge => "gauge",
-        }
-    }
-}
-
-/// One metric. `/metrics` and the documentation are generated from [`METRICS`].
-#[derive(Debug)]
-pub struct Metric {
-    /// Name, without labels.
-    pub name: &'static str,
-    /// Counter or gauge.
-    pub kind: Kind,
-    /// Unit of the value; `1` for ratios, states and counts.
-    pub unit: &'static str,
-    /// Meaning, one sentence.
-    pub help: &'static str,
-    /// Names of the labels, in the order of a series' values.
-    pub labels: &'static [&'static str],
-}
-
-macro_rules! metrics {
-    ($($id:ident $kind:ident $name:literal [$($label:literal),*] $unit:literal $help:literal)*) => {
-        $(pub(super) static $id: Metric = Metric {
-            name: $name, kind: Kind::$kind, unit: $unit, help: $help, labels: &[$($label),*],
-        };)*
-        /// All metrics of this module, in the order of the documentation.
-        pub static METRICS: &[&Metric] = &[$(&$id),*];
-    };
-}
+use crate::metric::metrics;
 
 metrics! {
     CPU_SECONDS Counter "blaze_node_cpu_seconds_total" ["cpu", "mode"] "seconds"

@@ -37,7 +37,7 @@ mod status;
 #[cfg(test)]
 mod tests;
 
-pub use metrics::{Kind, METRICS, Metric};
+pub use metrics::METRICS;
 pub use sample::{Label, Sample};
 pub use sampler::{Roots, Sampler};
 pub use status::{

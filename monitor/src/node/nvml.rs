@@ -9,7 +9,8 @@ use nvml_wrapper::{Device, Nvml};
 
 use super::file::Fault;
 use super::limits;
-use super::metrics::{ENERGY, GPU_MEMORY, GPU_UTILIZATION, Metric, POWER, TEMPERATURE};
+use super::metrics::{ENERGY, GPU_MEMORY, GPU_UTILIZATION, POWER, TEMPERATURE};
+use crate::metric::Metric;
 use super::sample::{Batch, Label};
 use super::sampler::Collector;
 use super::sensors::sense;

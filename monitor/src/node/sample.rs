@@ -4,7 +4,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::file::Fault;
-use super::metrics::{COLLECTOR_UP, Metric};
+use super::metrics::COLLECTOR_UP;
+use crate::metric::Metric;
 
 /// Value of a label. Cheap to clone; compared and hashed as text.
 #[derive(Clone, Debug)]

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use super::file::{Fault, Text, entries, word};
 use super::limits;
+use crate::metric::Metric;
 use super::metrics::{
-    BATTERY, GPU_MEMORY, GPU_UTILIZATION, Metric, POWER, TEMPERATURE,
+    BATTERY, GPU_MEMORY, GPU_UTILIZATION, POWER, TEMPERATURE,
 };
 use super::sample::{Batch, Label};
 use super::sampler::{Collector, Roots};

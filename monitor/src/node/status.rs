@@ -5,9 +5,10 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
+use crate::metric::Metric;
 use super::metrics::{
     BATTERY, CGROUP_THROTTLED, CLOCK_ERROR, CLOCK_SYNCHRONIZED, CPU_SECONDS, DISK, ENERGY,
-    GPU_MEMORY, GPU_UTILIZATION, MEMORY, Metric, NETWORK, NETWORK_DROPPED, POWER, TEMPERATURE,
+    GPU_MEMORY, GPU_UTILIZATION, MEMORY, NETWORK, NETWORK_DROPPED, POWER, TEMPERATURE,
     UDP_ERRORS,
 };
 use super::sample::{Label, Reading, Sample, Series, State};
