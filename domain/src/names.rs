@@ -10,6 +10,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::control::REPLY_PREFIX;
+use crate::identity::FlowId;
 
 /// Longest layer, node, service or instance name, in bytes.
 pub const MAX_NAME_BYTES: usize = 63;
@@ -273,6 +274,18 @@ impl From<&TopicName> for ChannelName {
 }
 
 impl TopicName {
+    /// Where the monitors of a layer are pinged.
+    #[must_use]
+    pub fn ping(layer: &LayerName) -> Self {
+        Self(Arc::from(format!("{PING_PREFIX}{layer}")))
+    }
+
+    /// Where the monitor of a node answers pings.
+    #[must_use]
+    pub fn pong(node: &FlowId) -> Self {
+        Self(Arc::from(format!("{PONG_PREFIX}{node}")))
+    }
+
     /// Whether it carries pings or their answers, which only `blaze-monitor` may advertise and
     /// request.
     #[must_use]
@@ -372,6 +385,9 @@ mod tests {
             let topic = of_monitors.parse::<TopicName>().unwrap();
             assert!(topic.is_for_monitors_alone() && !ChannelName::from(&topic).is_reserved());
         }
+        let node: FlowId = "edge/robot-1".parse().unwrap();
+        assert_eq!(TopicName::ping(&node.layer).as_str(), "blaze/ping/edge");
+        assert_eq!(TopicName::pong(&node).as_str(), "blaze/pong/edge/robot-1");
         for bad in ["blaze/ping", "blaze/ping/", "blaze/ping/a/b", "blaze/pong/a", "blaze/ping/A"] {
             assert!(bad.parse::<TopicName>().is_err(), "{bad}");
             assert!(
