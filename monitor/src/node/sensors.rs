@@ -4,9 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::file::{Fault, Text, entries, word};
 use super::limits;
-use super::metrics::{
-    BATTERY, GPU_MEMORY, GPU_UTILIZATION, Metric, POWER, TEMPERATURE,
-};
+use super::metrics::{BATTERY, GPU_MEMORY, GPU_UTILIZATION, Metric, POWER, TEMPERATURE};
 use super::sample::{Batch, Label};
 use super::sampler::{Collector, Roots};
 
@@ -28,12 +26,7 @@ pub(super) struct Sensor {
 }
 
 impl Sensor {
-    pub(super) fn new(
-        metric: &'static Metric,
-        label: Label,
-        file: PathBuf,
-        divisor: f64,
-    ) -> Self {
+    pub(super) fn new(metric: &'static Metric, label: Label, file: PathBuf, divisor: f64) -> Self {
         let labels = [label, "".into()];
         Self { metric, labels, file: Text::attribute(file), times: None, divisor }
     }
@@ -87,11 +80,7 @@ pub(super) struct Sensors {
 }
 
 impl Sensors {
-    pub(super) fn new(
-        name: &'static str,
-        roots: &Roots,
-        find: fn(&Path) -> Vec<Sensor>,
-    ) -> Self {
+    pub(super) fn new(name: &'static str, roots: &Roots, find: fn(&Path) -> Vec<Sensor>) -> Self {
         Self { name, sys: roots.sys.clone(), find, sensors: Vec::new(), buffer: Vec::new() }
     }
 }
