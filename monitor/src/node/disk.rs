@@ -17,6 +17,10 @@ const IMAGES: [&str; 6] = ["squashfs", "iso9660", "udf", "erofs", "cramfs", "rom
 /// File systems on a disk whose source is no path below /dev.
 const WITHOUT_DEVICE: [&str; 3] = ["zfs", "bcachefs", "ubifs"];
 
+/// Files of the host that container engines mount from their own disk.
+const OF_ENGINES: [&str; 4] =
+    ["/etc/hosts", "/etc/hostname", "/etc/resolv.conf", "/dev/termination-log"];
+
 /// Space of one file system.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SpaceStat {
@@ -142,6 +146,9 @@ fn select(entries: Vec<MountEntry>) -> Vec<Mount> {
 fn has_space(entry: &MountEntry) -> bool {
     let kind = entry.fs_vfstype.as_str();
     let device = entry.fs_spec.starts_with("/dev/") && !entry.fs_spec.starts_with("/dev/loop");
+    if IMAGES.contains(&kind) || OF_ENGINES.contains(&entry.fs_file.as_str()) {
+        return false;
+    }
     let root_of_container = kind == "overlay" && entry.fs_file == "/";
-    !IMAGES.contains(&kind) && (device || WITHOUT_DEVICE.contains(&kind) || root_of_container)
+    device || WITHOUT_DEVICE.contains(&kind) || root_of_container
 }

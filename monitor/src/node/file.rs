@@ -205,7 +205,11 @@ mod quick {
             assert_eq!(text.number(&mut buffer).unwrap(), value, "{content:?}");
         }
         let mut folder = Text::attribute(folder.path().to_owned());
-        assert_eq!(folder.number(&mut buffer).unwrap(), None, "a directory opens, but has no value");
+        assert_eq!(
+            folder.number(&mut buffer).unwrap(),
+            None,
+            "a directory opens, but has no value"
+        );
     }
 
     #[test]

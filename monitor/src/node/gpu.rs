@@ -63,9 +63,7 @@ impl Collector for Gpus {
 /// The GPU of a Jetson: `load` in per mille. It has no memory of its own.
 fn jetson(sys: &Path) -> Option<Card> {
     let devices = sys.join("devices");
-    let named = |name: &str| {
-        name == "gpu.0" || JETSON_NAMES.iter().any(|end| name.ends_with(end))
-    };
+    let named = |name: &str| name == "gpu.0" || JETSON_NAMES.iter().any(|end| name.ends_with(end));
     let device = JETSON_FOLDERS.iter().find_map(|folder| {
         let mut found = entries(&devices.join(folder), named).into_iter();
         found.find(|(_, path)| path.join("load").exists())
@@ -93,9 +91,8 @@ fn amd_card(card: &str, device: PathBuf) -> Card {
     let product = word(&device.join("product_name"));
     let number = || word(&device.join("device")).map(|number| format!("AMD {number}"));
     let name = product.or_else(number).map(|name| Label::new(&name));
-    let memory = |kind, file| {
-        Sensor::new(&GPU_MEMORY, label.clone(), device.join(file), 1.0).kind(kind)
-    };
+    let memory =
+        |kind, file| Sensor::new(&GPU_MEMORY, label.clone(), device.join(file), 1.0).kind(kind);
     let busy = device.join("gpu_busy_percent");
     let sensors = vec![
         Sensor::new(&GPU_UTILIZATION, label.clone(), busy, 100.0),

@@ -69,7 +69,8 @@ fn values(chip: &Chip) -> Vec<Sensor> {
     }) {
         let Some((channel, _)) = file.split_once('_') else { continue };
         let read = |item: &str| word(&chip.path.join(format!("{channel}_{item}")));
-        let duplicate = file.ends_with("_input") && chip.path.join(format!("{channel}_average")).exists();
+        let duplicate =
+            file.ends_with("_input") && chip.path.join(format!("{channel}_average")).exists();
         if read("fault").as_deref() == Some("1") || (channel.starts_with('p') && duplicate) {
             continue;
         }

@@ -12,15 +12,14 @@ use super::sensors::Sensor;
 
 /// The batteries of the machine. Those with the scope `Device` are in mice and keyboards.
 pub(super) fn batteries(sys: &Path) -> Vec<Sensor> {
-    let is = |path: &Path, file: &str, value: &str| word(&path.join(file)).as_deref() == Some(value);
+    let is =
+        |path: &Path, file: &str, value: &str| word(&path.join(file)).as_deref() == Some(value);
     entries(&sys.join("class/power_supply"), |_| true)
         .into_iter()
         .filter(|(_, path)| is(path, "type", "Battery") || is(path, "type", "UPS"))
         .filter(|(_, path)| !is(path, "scope", "Device") && !is(path, "present", "0"))
         .take(limits::LABEL_VALUES)
-        .map(|(name, path)| {
-            Sensor::new(&BATTERY, Label::new(&name), path.join("capacity"), 100.0)
-        })
+        .map(|(name, path)| Sensor::new(&BATTERY, Label::new(&name), path.join("capacity"), 100.0))
         .collect()
 }
 

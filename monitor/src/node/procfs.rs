@@ -34,9 +34,28 @@ const NO_DISKS: [&str; 8] = ["loop", "ram", "zram", "sr", "fd", "dm-", "md", "nb
 
 /// Names of interfaces that belong to containers and virtual machines, or that the kernel makes.
 const NO_INTERFACES: [&str; 22] = [
-    "veth", "cali", "lxc", "cilium_", "docker", "br-", "cni", "flannel", "nodelocaldns",
-    "kube-ipvs", "virbr", "vnet", "ifb", "dummy", "sit", "ip6tnl", "tunl", "gre", "erspan",
-    "ip_vti", "ip6_vti", "ip6gre",
+    "veth",
+    "cali",
+    "lxc",
+    "cilium_",
+    "docker",
+    "br-",
+    "cni",
+    "flannel",
+    "nodelocaldns",
+    "kube-ipvs",
+    "virbr",
+    "vnet",
+    "ifb",
+    "dummy",
+    "sit",
+    "ip6tnl",
+    "tunl",
+    "gre",
+    "erspan",
+    "ip_vti",
+    "ip6_vti",
+    "ip6gre",
 ];
 
 /// A table and its parser.
@@ -62,11 +81,8 @@ struct State {
 pub(super) fn collectors(roots: &Roots) -> Vec<Box<dyn Collector>> {
     let table = |name, files: &[&str], parse| -> Box<dyn Collector> {
         let files = files.iter().map(|file| Text::table(roots.proc.join(file))).collect();
-        let state = State {
-            block: roots.sys.join("block"),
-            labels: HashMap::new(),
-            counters: Vec::new(),
-        };
+        let state =
+            State { block: roots.sys.join("block"), labels: HashMap::new(), counters: Vec::new() };
         Box::new(Table { name, files, parse, state, buffer: Vec::new() })
     };
     vec![
@@ -95,7 +111,8 @@ impl Collector for Table {
             let Some(text) = batch.take(text) else { continue };
             // without its content a table is there and has nothing to say, as without Wi-Fi
             let parsed = (self.parse)(&mut self.state, index, &text, batch);
-            let named = |error| Fault::Form { source_name: file.path().display().to_string(), error };
+            let named =
+                |error| Fault::Form { source_name: file.path().display().to_string(), error };
             batch.take(parsed.map(Some).map_err(named));
         }
         if self.name == "udp" {
@@ -174,7 +191,8 @@ fn cpu(state: &mut State, _: usize, text: &str, batch: &mut Batch) -> Result<(),
 
 fn modes(state: &mut State, cpu: usize, time: &CpuTime) -> Modes {
     let seconds = |ticks: u64| ticks as f64 / USER_HZ as f64;
-    let system = time.system + time.irq.unwrap_or(0) + time.softirq.unwrap_or(0);
+    let interrupts = time.irq.unwrap_or(0).saturating_add(time.softirq.unwrap_or(0));
+    let system = time.system.saturating_add(interrupts);
     [
         seconds(time.user.saturating_add(time.nice)),
         seconds(system),
@@ -204,7 +222,15 @@ fn pressure(_: &mut State, index: usize, text: &str, batch: &mut Batch) -> Resul
     Ok(())
 }
 
+/// More memory than this in KiB is none; the parser computes bytes without a check.
+const MEMORY_KIB_MAX: u64 = 1 << 50;
+
 fn memory(_: &mut State, _: usize, text: &str, batch: &mut Batch) -> Result<(), String> {
+    let small = |word: &str| word.parse::<u64>().map_or(true, |kib| kib <= MEMORY_KIB_MAX);
+    // the parser cuts the last byte of a name, and multiplies without a check
+    if !text.is_ascii() || !text.split_ascii_whitespace().all(small) {
+        return Err("a name is not ASCII, or a number is too large".to_owned());
+    }
     let info = Meminfo::from_buf_read(text.as_bytes()).map_err(reason)?;
     if info.mem_total == 0 {
         return Ok(());

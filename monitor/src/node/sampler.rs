@@ -131,11 +131,7 @@ fn silent(age: Duration) -> String {
 }
 
 /// Body of a collector's thread. It ends with the sampler; one that blocks ends with the process.
-fn run(
-    mut collector: Box<dyn Collector>,
-    signal: &Signal,
-    latest: &Mutex<Option<Arc<Reading>>>,
-) {
+fn run(mut collector: Box<dyn Collector>, signal: &Signal, latest: &Mutex<Option<Arc<Reading>>>) {
     let mut seen = 0;
     let mut discovered: Option<Instant> = None;
     loop {

@@ -4,12 +4,10 @@ use std::path::{Path, PathBuf};
 
 use super::file::{Fault, Text, entries, word};
 use super::limits;
-use crate::metric::Metric;
-use super::metrics::{
-    BATTERY, GPU_MEMORY, GPU_UTILIZATION, POWER, TEMPERATURE,
-};
+use super::metrics::{BATTERY, GPU_MEMORY, GPU_UTILIZATION, POWER, TEMPERATURE};
 use super::sample::{Batch, Label};
 use super::sampler::{Collector, Roots};
+use crate::metric::Metric;
 
 /// Zones with values of no use: a constant 100 °C on Jetson, and an estimate for the fan.
 const NO_ZONES: [&str; 2] = ["PMIC-Die", "thermal-fan-est"];
@@ -29,12 +27,7 @@ pub(super) struct Sensor {
 }
 
 impl Sensor {
-    pub(super) fn new(
-        metric: &'static Metric,
-        label: Label,
-        file: PathBuf,
-        divisor: f64,
-    ) -> Self {
+    pub(super) fn new(metric: &'static Metric, label: Label, file: PathBuf, divisor: f64) -> Self {
         let labels = [label, "".into()];
         Self { metric, labels, file: Text::attribute(file), times: None, divisor }
     }
@@ -88,11 +81,7 @@ pub(super) struct Sensors {
 }
 
 impl Sensors {
-    pub(super) fn new(
-        name: &'static str,
-        roots: &Roots,
-        find: fn(&Path) -> Vec<Sensor>,
-    ) -> Self {
+    pub(super) fn new(name: &'static str, roots: &Roots, find: fn(&Path) -> Vec<Sensor>) -> Self {
         Self { name, sys: roots.sys.clone(), find, sensors: Vec::new(), buffer: Vec::new() }
     }
 }

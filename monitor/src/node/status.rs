@@ -287,11 +287,12 @@ impl Sample {
                 continue;
             }
             let label = &series.labels()[0];
-            let index = gpus.iter().position(|gpu| gpu.gpu == label.as_str()).unwrap_or_else(|| {
-                let (gpu, name) = (label.to_string(), self.gpu_name(label));
-                gpus.push(GpuStatus { gpu, name, ..GpuStatus::default() });
-                gpus.len() - 1
-            });
+            let index =
+                gpus.iter().position(|gpu| gpu.gpu == label.as_str()).unwrap_or_else(|| {
+                    let (gpu, name) = (label.to_string(), self.gpu_name(label));
+                    gpus.push(GpuStatus { gpu, name, ..GpuStatus::default() });
+                    gpus.len() - 1
+                });
             let gpu = &mut gpus[index];
             match series.labels().get(1).map(Label::as_str) {
                 None => gpu.utilization_ratio = Some(series.value),
@@ -357,7 +358,8 @@ impl<'a> Rates<'a> {
         if seconds <= 0.0 {
             return;
         }
-        let old: HashMap<_, _> = old.series.iter().map(|series| (key(series), series.value)).collect();
+        let old: HashMap<_, _> =
+            old.series.iter().map(|series| (key(series), series.value)).collect();
         for series in &new.series {
             // a counter that is smaller than before has started again
             if let Some(rise) = old.get(&key(series)).map(|old| series.value - old)
