@@ -119,10 +119,6 @@ impl Rows {
         self.rows.iter()
     }
 
-    pub(super) fn contains(&self, key: &Key) -> bool {
-        self.rows.contains_key(key)
-    }
-
     /// The row of a pair, or that of the others.
     pub(super) fn of(
         &mut self,
