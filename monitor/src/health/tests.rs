@@ -36,11 +36,7 @@ impl Bench {
         self.run_with(seconds, |_| inputs.clone())
     }
 
-    fn run_with(
-        &mut self,
-        seconds: u64,
-        inputs: impl Fn(u64) -> Inputs,
-    ) -> Vec<(u64, Change)> {
+    fn run_with(&mut self, seconds: u64, inputs: impl Fn(u64) -> Inputs) -> Vec<(u64, Change)> {
         let mut changes = Vec::new();
         for _ in 0..seconds {
             let s = self.ms / 1_000;
@@ -211,10 +207,8 @@ fn a_healthy_system_and_a_node_without_programs_have_no_problem() {
     }))
     .ok();
     assert_eq!(healthy.flows[0].summary.as_ref().unwrap().links.len(), 1);
-    let no_requester =
-        TopicInput { is_requested: false, ..topic("alone", WhyCode::NoRequest) };
-    let thinned =
-        TopicInput { priority: Priority::Bulk, ..topic("camera", WhyCode::RateLimited) };
+    let no_requester = TopicInput { is_requested: false, ..topic("alone", WhyCode::NoRequest) };
+    let thinned = TopicInput { priority: Priority::Bulk, ..topic("camera", WhyCode::RateLimited) };
     let busy = TopicInput {
         advertised_hz: Some(50.0),
         rate_hz: Some(49.0),
@@ -268,23 +262,18 @@ fn all_wrong(s: u64) -> Vec<Inputs> {
     };
     let mut links = flow();
     let lossy = Link { loss: 0.1, rtt_ms: Some(20.0), ..link("c/lossy", "up") };
-    let full =
-        Link { wire_bytes_per_s: 96.0, limit_bytes_per_s: 100.0, ..link("c/full", "up") };
+    let full = Link { wire_bytes_per_s: 96.0, limit_bytes_per_s: 100.0, ..link("c/full", "up") };
     let links_of = vec![link("c/down", "down"), link("c/suspect", "suspect"), lossy, full];
     links.summary = Some(Summary { links: links_of, feasible: false });
-    let silent = TopicInput {
-        advertised_hz: Some(1.0),
-        rate_hz: Some(0.0),
-        ..topic("silent", WhyCode::Ok)
-    };
+    let silent =
+        TopicInput { advertised_hz: Some(1.0), rate_hz: Some(0.0), ..topic("silent", WhyCode::Ok) };
     let dropping = TopicInput {
         dropped: [("queue_full".to_owned(), s), ("max_rate".to_owned(), 7 * s)].into(),
         ..topic("dropping", WhyCode::Ok)
     };
     links.topics = vec![silent, dropping];
     let mut topics = flow();
-    topics.topics =
-        WhyCode::ALL.iter().map(|code| topic(&format!("why/{code}"), *code)).collect();
+    topics.topics = WhyCode::ALL.iter().map(|code| topic(&format!("why/{code}"), *code)).collect();
     vec![counters, of_flow(links), of_flow(topics)]
 }
 
@@ -328,10 +317,8 @@ fn the_table_is_fit_for_pages_and_alerts() {
 
 #[test]
 fn a_service_that_is_lost_is_gone_and_one_that_ends_is_not() {
-    let with = |services: Vec<ServiceInput>| Inputs {
-        services: Some(services),
-        ..Inputs::default()
-    };
+    let with =
+        |services: Vec<ServiceInput>| Inputs { services: Some(services), ..Inputs::default() };
     let both = with(vec![
         service("lost", ServiceState::Ready),
         service("stopped", ServiceState::Stopping),
@@ -356,10 +343,8 @@ fn a_service_that_is_lost_is_gone_and_one_that_ends_is_not() {
 
 #[test]
 fn an_outage_of_the_signs_of_life_is_no_fault_of_services() {
-    let readable = Inputs {
-        services: Some(vec![service("slam", ServiceState::Ready)]),
-        ..Inputs::default()
-    };
+    let readable =
+        Inputs { services: Some(vec![service("slam", ServiceState::Ready)]), ..Inputs::default() };
     let mut bench = Bench::new();
     bench.run(10, &readable);
     bench.run(60, &Inputs::default());
@@ -399,11 +384,8 @@ fn one_cause_is_one_problem() {
 #[test]
 fn a_topic_is_silent_after_three_of_its_periods() {
     let silent = |hz: f64| {
-        let topic = TopicInput {
-            advertised_hz: Some(hz),
-            rate_hz: Some(0.0),
-            ..topic("t", WhyCode::Ok)
-        };
+        let topic =
+            TopicInput { advertised_hz: Some(hz), rate_hz: Some(0.0), ..topic("t", WhyCode::Ok) };
         of_flow(FlowInput { topics: vec![topic], ..flow() })
     };
     for (hz, after) in [(50.0, Some(5)), (0.1, Some(30)), (0.0, None), (1e-9, None)] {
@@ -493,7 +475,7 @@ fn the_metric_is_1_for_one_state_of_each_and_its_names_are_bounded() {
             let found = metric.get_label().iter().find(|label| label.name() == name);
             found.unwrap().value().to_owned()
         };
-        let value = metric.get_gauge().value();
+        let value = metric.get_gauge().get_value();
         *sums.entry((label("scope"), label("name"))).or_default() += value;
         if value > 0.5 {
             present.insert(label("name"), label("state"));

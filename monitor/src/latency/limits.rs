@@ -12,6 +12,8 @@ pub(super) const WINDOW: usize = 256;
 pub(super) const MAX_WRITERS: usize = 4_096;
 /// A pair that is silent this long gives its place to a new one when there is no other.
 pub(super) const IDLE: Duration = Duration::from_secs(600);
+/// Idle pairs are looked for this often while there is no room: messages of `_other` may be many.
+pub(super) const SWEEP_EVERY: Duration = Duration::from_secs(60);
 /// Raw samples that wait to be taken; about 150 bytes each. The oldest give way.
 pub(super) const MAX_SAMPLES: usize = 10_000;
 /// Error in seconds below which a clock is good enough whatever the latency is.

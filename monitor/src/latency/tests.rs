@@ -1,6 +1,7 @@
 use std::time::{Duration, Instant};
 
 use blaze_domain::WriterId;
+use prometheus::proto::LabelPair;
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
@@ -60,11 +61,11 @@ fn flow_figures(rtt_ms: f64) -> FlowFigures {
 }
 
 /// An item of `/v1/bridges`.
-fn bridge(topic: &str, from: &str, to: Value, latency: Value, age: Value) -> Bridge {
+fn bridge(topic: &str, from: &str, to: &Value, time: &Value, age: &Value) -> Bridge {
     serde_json::from_value(json!({
         "id": "", "topic": topic, "from": {"scope": from, "broker": "dds"}, "to": to,
         "state": "up", "in": {"messages": 455, "bytes": 1}, "out": {"messages": 455, "bytes": 1},
-        "dropped": {}, "latency_ms": latency, "age_ms": age,
+        "dropped": {}, "latency_ms": time, "age_ms": age,
     }))
     .unwrap()
 }
@@ -75,13 +76,13 @@ fn both_flows() -> Vec<FlowFigures> {
     let to_layer = json!({"scope": "layer", "broker": "kafka", "flow": "cloud/cloud-1"});
     let time = json!({"p50": 0.5, "p99": 1.5});
     let age = json!({"p50": 14.0, "p99": 30.0});
-    here.bridges = vec![bridge("imu/data", "inter", to_layer, time, age)];
+    here.bridges = vec![bridge("imu/data", "inter", &to_layer, &time, &age)];
     let to_cloud = json!({"scope": "inter", "broker": "dds", "flow": "cloud/cloud-1"});
     let time = json!({"p50": 1.0, "p99": 2.0});
     let sender = FlowFigures {
         flow: "edge/robot-1".parse().unwrap(),
         is_here: false,
-        bridges: vec![bridge("imu/data", "node", to_cloud, time, Value::Null)],
+        bridges: vec![bridge("imu/data", "node", &to_cloud, &time, &Value::Null)],
         links: Vec::new(),
         publishers: Default::default(),
     };
@@ -143,7 +144,8 @@ proptest! {
                 prop_assert!((0.0..=3_600.0).contains(&measured.latency_s));
             }
         }
-        latency.body();
+        let rows = latency.body().topics;
+        prop_assert_eq!(rows[0].messages, 3);
     }
 }
 
@@ -151,8 +153,7 @@ proptest! {
 fn within_the_error_it_is_zero_and_beyond_the_offset_is_dropped() {
     let (mut latency, pair) = (subscribed(), Pair::new("t", "edge/robot-1"));
     let mut measure = |later_ns: i64, age_ns| {
-        let message =
-            Message { offset: offset(0.0, 0.001), age_ns, ..pair.message(later_ns) };
+        let message = Message { offset: offset(0.0, 0.001), age_ns, ..pair.message(later_ns) };
         let outcome = latency.message(Instant::now(), &message);
         let got = outcome.measured.map(|measured| (measured.latency_s, measured.method));
         (got, outcome.drop_offset)
@@ -283,15 +284,15 @@ fn a_passive_topic_has_a_row_from_the_flows_figures() {
     assert_eq!(
         serde_json::to_value(latency.body()).unwrap(),
         json!({"left_out": 0, "topics": [{
-            "topic": "imu/data", "from": "edge/robot-1", "observe": "flow", "stamp": "publish",
-            "method": "age", "messages": 455, "latency_ms": {"p50": 14.0, "p99": 30.0},
-            "error_ms": 10.0, "unknown": 0, "lost": null,
-            "hops": [
-                {"where": "flow edge/robot-1", "p50_ms": 1.0, "p99_ms": 2.0},
-                {"where": "link edge/robot-1", "p50_ms": 10.0, "p99_ms": 10.0},
-                {"where": "flow cloud/cloud-1", "p50_ms": 0.5, "p99_ms": 1.5},
-                {"where": "brokers", "p50_ms": 2.5, "p99_ms": 16.5},
-            ]}]})
+        "topic": "imu/data", "from": "edge/robot-1", "observe": "flow", "stamp": "publish",
+        "method": "age", "messages": 455, "latency_ms": {"p50": 14.0, "p99": 30.0},
+        "error_ms": 10.0, "unknown": 0, "lost": null,
+        "hops": [
+            {"where": "flow edge/robot-1", "p50_ms": 1.0, "p99_ms": 2.0},
+            {"where": "link edge/robot-1", "p50_ms": 10.0, "p99_ms": 10.0},
+            {"where": "flow cloud/cloud-1", "p50_ms": 0.5, "p99_ms": 1.5},
+            {"where": "brokers", "p50_ms": 2.5, "p99_ms": 16.5},
+        ]}]})
     );
     let message = latency.message(Instant::now(), &Pair::new("imu/data", "a/b").message(MS));
     assert_eq!(message, Outcome::default(), "it has no subscriber");
@@ -360,15 +361,14 @@ fn the_metrics_are_those_of_the_table() {
     latency.message(Instant::now(), &unknown);
     latency.message(Instant::now(), &Message { offset: offset(0.0, 0.0005), ..unknown });
     let families = latency.metrics();
-    let names: Vec<&str> = families.iter().map(|family| family.name()).collect();
+    let names: Vec<&str> = families.iter().map(MetricFamily::name).collect();
     assert_eq!(names, METRICS.iter().map(|metric| metric.name).collect::<Vec<_>>());
     for (family, metric) in families.iter().zip(METRICS) {
         let [series] = family.get_metric() else { panic!("{}", metric.name) };
-        let labels: BTreeSet<&str> =
-            series.get_label().iter().map(|label| label.name()).collect();
+        let labels: BTreeSet<&str> = series.get_label().iter().map(LabelPair::name).collect();
         assert_eq!(labels, metric.labels.iter().copied().collect(), "{}", metric.name);
     }
     assert_eq!(families[0].get_metric()[0].get_histogram().get_sample_count(), 1);
-    assert!((families[1].get_metric()[0].get_gauge().value() - 0.0005).abs() < 1e-6);
-    assert!((families[2].get_metric()[0].get_counter().value() - 1.0).abs() < 1e-9);
+    assert!((families[1].get_metric()[0].get_gauge().get_value() - 0.0005).abs() < 1e-6);
+    assert!((families[2].get_metric()[0].get_counter().get_value() - 1.0).abs() < 1e-9);
 }
