@@ -1,4 +1,5 @@
-//! All codes of problems that this node finds: one table, from which pages and alerts are generated.
+//! All codes of problems that this node finds: one table, from which pages and alerts are
+//! generated.
 
 use std::time::Duration;
 
