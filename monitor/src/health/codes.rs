@@ -1,13 +1,12 @@
-//! All codes of problems that this node finds: one table, from which pages and alerts are generated.
+//! All codes of problems that this node finds: one table, from which pages and alerts are
+//! generated.
 
 use std::time::Duration;
 
 use serde::Serialize;
 
 use super::State;
-use super::limits::{
-    BRIDGE_STARTING_AFTER, LIMIT_AFTER, STALE_AFTER, STARTING_AFTER, WORSE_AFTER,
-};
+use super::limits::{BRIDGE_STARTING_AFTER, LIMIT_AFTER, STALE_AFTER, STARTING_AFTER, WORSE_AFTER};
 
 /// What a problem is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
@@ -37,7 +36,7 @@ impl Scope {
 }
 
 /// One kind of problem.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Code {
     /// The word; with `scope` the key of the table.
     pub code: &'static str,

@@ -1,7 +1,8 @@
 //! Health of this node and its services: pure, with `now` as a parameter.
 //!
 //! ```text
-//! Inputs ──Finder, Services──► conditions ──Tracker──► problems ──► states ──► /v1/health, blaze_health
+//! Inputs ──Finder, Services──► conditions ──Tracker──► problems ──► states
+//!                                                        └─► /v1/health ◄──┘
 //! ```
 //!
 //! A problem of the node itself counts in full for the node's state; a link, topic or service that

@@ -41,11 +41,7 @@ pub(super) struct Services {
 
 impl Services {
     /// Takes all signs of life; without them nothing is known and nothing is found.
-    pub(super) fn update(
-        &mut self,
-        now: Moment,
-        signs: Option<&[ServiceInput]>,
-    ) -> Vec<Condition> {
+    pub(super) fn update(&mut self, now: Moment, signs: Option<&[ServiceInput]>) -> Vec<Condition> {
         let Some(signs) = signs else {
             self.unreadable.get_or_insert(now.at);
             return Vec::new();

@@ -98,8 +98,7 @@ impl Tracker {
             }
             None if is_full => false,
             None => {
-                let entry =
-                    Entry { condition, since: now, is_problem: false, absent_since: None };
+                let entry = Entry { condition, since: now, is_problem: false, absent_since: None };
                 self.entries.insert(key.clone(), entry);
                 true
             }
@@ -112,12 +111,8 @@ impl Tracker {
         let rest = Condition::new(Scope::Node, "more_problems", "blaze-monitor", detail);
         let Some(rest) = rest.filter(|_| count > 0) else { return };
         let key = rest.key();
-        let fresh = || Entry {
-            condition: rest.clone(),
-            since: now,
-            is_problem: false,
-            absent_since: None,
-        };
+        let fresh =
+            || Entry { condition: rest.clone(), since: now, is_problem: false, absent_since: None };
         let entry = self.entries.entry(key.clone()).or_insert_with(fresh);
         entry.condition = rest.clone();
         entry.absent_since = None;
@@ -161,9 +156,10 @@ impl Tracker {
 
     /// The worst state of the problems of some scopes and names.
     pub(super) fn worst(&self, counts: impl Fn(Scope, &str) -> bool) -> Option<State> {
-        let entries = self.entries.iter().filter(|((scope, _, name), entry)| {
-            entry.is_problem && counts(*scope, name)
-        });
+        let entries = self
+            .entries
+            .iter()
+            .filter(|((scope, _, name), entry)| entry.is_problem && counts(*scope, name));
         entries.map(|(_, entry)| entry.condition.code.state).max()
     }
 }

@@ -8,7 +8,7 @@ use blaze_domain::{FlowId, TopicName, WriterId};
 use prometheus::{Histogram, HistogramVec};
 
 use super::flows::Quantiles;
-use super::limits::{IDLE, MAX_LABELS, MAX_PAIRS, MAX_WRITERS, WINDOW};
+use super::limits::{IDLE, MAX_LABELS, MAX_PAIRS, MAX_WRITERS, SWEEP_EVERY, WINDOW};
 use super::measure::{Measured, Method};
 
 /// Label of what is beyond the bounds.
@@ -112,15 +112,16 @@ impl Row {
 #[derive(Debug, Default)]
 pub(super) struct Rows {
     rows: BTreeMap<Key, Row>,
+    /// Topics and nodes of the rows.
+    topics: BTreeSet<String>,
+    nodes: BTreeSet<String>,
+    /// When idle rows were last looked for.
+    swept: Option<Instant>,
 }
 
 impl Rows {
     pub(super) fn iter(&self) -> impl Iterator<Item = (&Key, &Row)> {
         self.rows.iter()
-    }
-
-    pub(super) fn contains(&self, key: &Key) -> bool {
-        self.rows.contains_key(key)
     }
 
     /// The row of a pair, or that of the others.
@@ -135,6 +136,8 @@ impl Rows {
         let mut key = Key::new(topic.as_str(), from);
         if !self.rows.contains_key(&key) {
             self.bound(&mut key, now, metric);
+            self.topics.insert(key.topic.clone());
+            self.nodes.insert(key.node.clone());
         }
         let row = self.rows.entry(key.clone()).or_insert_with(|| Row::new(stamp, now));
         row.seen = now;
@@ -142,11 +145,7 @@ impl Rows {
     }
 
     /// Keeps those that fit, without their series.
-    pub(super) fn retain(
-        &mut self,
-        metric: &HistogramVec,
-        keep: impl Fn(&Key, &Row) -> bool,
-    ) {
+    pub(super) fn retain(&mut self, metric: &HistogramVec, keep: impl Fn(&Key, &Row) -> bool) {
         self.rows.retain(|key, row| {
             let is_kept = keep(key, row);
             if !is_kept {
@@ -158,14 +157,17 @@ impl Rows {
             }
             is_kept
         });
+        self.topics = self.rows.keys().map(|key| key.topic.clone()).collect();
+        self.nodes = self.rows.keys().map(|key| key.node.clone()).collect();
     }
 
     /// Replaces what has no room by `_other`, once pairs that are silent have left.
     fn bound(&mut self, key: &mut Key, now: Instant, metric: &HistogramVec) {
-        if self.exceeds(key) == (false, false) {
-            return;
+        let is_due = |swept| now.saturating_duration_since(swept) >= SWEEP_EVERY;
+        if self.exceeds(key) != (false, false) && self.swept.is_none_or(is_due) {
+            self.swept = Some(now);
+            self.retain(metric, |_, row| now.saturating_duration_since(row.seen) < IDLE);
         }
-        self.retain(metric, |_, row| now.saturating_duration_since(row.seen) < IDLE);
         let (topic, node) = self.exceeds(key);
         if topic {
             OTHER.clone_into(&mut key.topic);
@@ -181,12 +183,9 @@ impl Rows {
         if self.rows.len() >= MAX_PAIRS - 1 {
             return (true, true);
         }
-        let topics: BTreeSet<&str> = self.rows.keys().map(|key| key.topic.as_str()).collect();
-        let nodes: BTreeSet<&str> = self.rows.keys().map(|key| key.node.as_str()).collect();
-        let is_full = |set: &BTreeSet<&str>, name: &str| {
-            set.len() >= MAX_LABELS - 1 && !set.contains(name)
-        };
-        (is_full(&topics, &key.topic), is_full(&nodes, &key.node))
+        let is_full =
+            |set: &BTreeSet<String>, name| set.len() >= MAX_LABELS - 1 && !set.contains(name);
+        (is_full(&self.topics, &key.topic), is_full(&self.nodes, &key.node))
     }
 }
 
