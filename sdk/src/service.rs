@@ -249,7 +249,7 @@ impl ServiceManager {
         &self.cache
     }
 
-    /// Metrics of the service.
+    /// Metrics of the service, its own and those of the SDK.
     #[must_use]
     pub fn monitor(&self) -> &MonitorManager {
         &self.shared.monitor

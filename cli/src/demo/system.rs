@@ -7,8 +7,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use blaze_domain::ServiceName;
 use blaze_sdk::{
-    Advertise, ConfigListener, Lease, MetricsEndpoint, PublishOptions, Publisher, Request, ServiceManager,
-    ServiceOptions, SubscribeOptions, Subscription,
+    Advertise, ConfigListener, Lease, MetricsEndpoint, PublishOptions, Publisher, Request,
+    ServiceManager, ServiceOptions, SubscribeOptions, Subscription,
 };
 use bytes::Bytes;
 use futures::future::join_all;

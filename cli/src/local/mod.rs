@@ -21,8 +21,8 @@ use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_domain::{InstanceName, Reliability, Scope, ServiceName, TopicName};
 use blaze_runtime::config::Sources;
 use blaze_sdk::{
-    FlowError, Lease, Message, MetricsEndpoint, Request, ServiceManager, ServiceOptions, SubscribeOptions,
-    Subscription,
+    FlowError, Lease, Message, MetricsEndpoint, Request, ServiceManager, ServiceOptions,
+    SubscribeOptions, Subscription,
 };
 use clap::Args;
 

@@ -17,7 +17,8 @@ use blaze_domain::{Scope, ServiceName};
 use blaze_runtime::config::Verdict;
 use blaze_runtime::{Readiness, Supervisor, TaskPolicy};
 use blaze_sdk::{
-    CacheManager, MetricsEndpoint, ProgramConfig, SdkError, ServiceManager, ServiceOptions, ServiceState,
+    CacheManager, MetricsEndpoint, ProgramConfig, SdkError, ServiceManager, ServiceOptions,
+    ServiceState,
 };
 
 use super::RunningFlow;

@@ -28,8 +28,8 @@ use prometheus::{IntCounterVec, IntGauge, Opts, Registry, TextEncoder};
 pub(crate) use endpoint::Endpoint;
 pub use endpoint::MetricsEndpoint;
 pub use family::Metric;
-pub(crate) use topics::{Counted, Counting, Counts, Times, Topics};
 use shape::Shape;
+pub(crate) use topics::{Counted, Counting, Counts, Times, Topics};
 use values::Value;
 pub use values::{Counter, Gauge, Histogram};
 

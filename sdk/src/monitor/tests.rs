@@ -262,7 +262,8 @@ async fn a_service_is_scraped_and_its_watchdog_names_the_address() -> Result<(),
     assert_eq!(sign["metrics"], address.as_str());
 
     // As the example of the page has it.
-    let count = service.monitor().counter("echo_messages_total", "Messages echoed", &["service"])?;
+    let count =
+        service.monitor().counter("echo_messages_total", "Messages echoed", &["service"])?;
     let topic: TopicName = "imu/data".parse()?;
     let options = SubscribeOptions { max_messages: 8, ..SubscribeOptions::default() };
     let callback = move |message: Message| count.labels(&[&message.origin().service]).inc();
@@ -320,7 +321,9 @@ async fn a_port_that_is_taken_is_an_error_and_off_serves_nothing() {
 #[test]
 fn callbacks_are_counted_in_buckets() {
     let mut times = Times::default();
-    [100_u64, 101, 4_999_999, 9_000_000].map(Duration::from_micros).map(|time| times.add(time));
+    for time in [100, 101, 4_999_999, 9_000_000] {
+        times.add(Duration::from_micros(time));
+    }
     let counts = Counts { callbacks: Some(times), ..Counts::default() };
     struct Fixed(Counts);
     impl Counted for Fixed {
