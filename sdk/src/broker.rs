@@ -42,7 +42,8 @@ impl LocalBroker {
                 large: options.large,
             },
         )?;
-        Ok(Publisher::new(topic, self.shared.identity.origin(), options, to))
+        let origin = self.shared.identity.origin();
+        Ok(Publisher::new(topic, origin, options, to, self.shared.monitor.topics()))
     }
 
     /// Calls back for each message of a topic that is published from now on, on the service's pool

@@ -5,7 +5,8 @@
 //! ServiceManager ──────┤
 //!                      ├─ flow(): advertise and request topics; leases renew themselves
 //!                      ├─ config(): its configuration, and callbacks when it changes
-//!                      └─ cache(): says that it lives, waits for others, keeps values for a while
+//!                      ├─ cache(): says that it lives, waits for others, keeps values for a while
+//!                      └─ monitor(): counters, gauges and histograms, served to Prometheus
 //! ```
 //!
 //! ```
@@ -50,6 +51,7 @@ mod cache;
 mod config;
 mod flow;
 mod message;
+mod monitor;
 mod options;
 mod pool;
 mod publisher;
@@ -72,6 +74,7 @@ pub use flow::{
     OriginFilter, RefusalCode, Request,
 };
 pub use message::Message;
+pub use monitor::{Counter, Gauge, Histogram, Metric, MetricsEndpoint, MonitorManager};
 pub use options::ServiceOptions;
 pub use publisher::{PublishOptions, Publisher};
 pub use service::{Identity, SdkError, ServiceManager};

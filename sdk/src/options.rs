@@ -9,7 +9,8 @@ use blaze_domain::node_file::RedisBroker;
 use blaze_domain::{InstanceName, LayerName, NodeName, Scope, ServiceName};
 use blaze_runtime::Supervisor;
 
-use crate::SdkError;
+use crate::service::now_ms;
+use crate::{Identity, MetricsEndpoint, SdkError};
 
 /// Bounds of `watchdog_ttl`.
 const MIN_WATCHDOG_TTL: Duration = Duration::from_secs(1);
@@ -52,6 +53,8 @@ pub struct ServiceOptions {
     pub watchdog_ttl: Duration,
     /// Version of the program, for those who look at services; at most 256 bytes.
     pub version: String,
+    /// Where its metrics are served. A program that serves them at a port of its own turns it off.
+    pub metrics: MetricsEndpoint,
     /// Services that must be ready before this one has started.
     pub wait_for: Vec<ServiceName>,
     /// How long to wait for them.
@@ -83,6 +86,7 @@ impl ServiceOptions {
             cache: None,
             watchdog_ttl: Duration::from_secs(15),
             version: String::new(),
+            metrics: MetricsEndpoint::Environment,
             wait_for: Vec::new(),
             wait_timeout: Duration::from_secs(30),
         }
@@ -117,6 +121,17 @@ impl ServiceOptions {
             });
         }
         Ok(())
+    }
+
+    /// Who the service is. One without an epoch of its own begins now.
+    pub(crate) fn identity(&self) -> Identity {
+        Identity {
+            layer: self.layer.clone(),
+            node: self.node.clone(),
+            service: self.service.clone(),
+            instance: self.instance.clone(),
+            epoch: if self.epoch == 0 { now_ms() } else { self.epoch },
+        }
     }
 
     /// The same service on a node.

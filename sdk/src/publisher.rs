@@ -1,16 +1,20 @@
 //! Publishing on a topic.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use blaze_brokers::PublishOutcome;
 use blaze_domain::control::{MAX_ENCODING_BYTES, MAX_TYPE_BYTES};
-use blaze_domain::{MAX_PAYLOAD_BYTES, Origin, Priority, Reliability, TopicName, WriterId};
+use blaze_domain::{
+    DropReason, MAX_PAYLOAD_BYTES, Origin, Priority, Reliability, TopicName, WriterId,
+};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 use parking_lot::Mutex;
 
 use crate::SdkError;
+use crate::monitor::{Counted, Counting, Counts, Topics};
 
 /// What a publisher says of all its messages.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -67,6 +71,8 @@ impl PublishOptions {
 #[derive(Clone)]
 pub struct Publisher {
     shared: Arc<Shared>,
+    /// Until the last clone is dropped.
+    _counting: Arc<Counting>,
 }
 
 struct Shared {
@@ -75,9 +81,16 @@ struct Shared {
     writer: WriterId,
     /// How long a message is of use; zero = for ever.
     lifespan: Duration,
-    /// What all messages have in common, and the last sequence. Locked until the broker has the
-    /// message, so that sequences reach it in order.
-    next: Mutex<Header>,
+    /// Locked until the broker has the message, so that sequences reach it in order.
+    next: Mutex<Next>,
+}
+
+struct Next {
+    /// What all messages have in common, and the last sequence.
+    header: Header,
+    /// Messages that the broker did not take.
+    dropped: u64,
+    too_large: u64,
 }
 
 impl Publisher {
@@ -86,6 +99,7 @@ impl Publisher {
         origin: Origin,
         options: &PublishOptions,
         to: Arc<dyn blaze_brokers::Publisher>,
+        topics: &Arc<Topics>,
     ) -> Self {
         let writer = WriterId(rand::random());
         let lifespan_ms = lifespan_ms(options.lifespan);
@@ -98,15 +112,15 @@ impl Publisher {
             depth: options.depth,
             ..Header::new(topic.as_str(), origin, writer, 0, 0)
         };
-        Self {
-            shared: Arc::new(Shared {
-                to,
-                topic: topic.clone(),
-                writer,
-                lifespan: options.lifespan,
-                next: Mutex::new(header),
-            }),
-        }
+        let shared = Arc::new(Shared {
+            to,
+            topic: topic.clone(),
+            writer,
+            lifespan: options.lifespan,
+            next: Mutex::new(Next { header, dropped: 0, too_large: 0 }),
+        });
+        let counting = topics.count(topic, Arc::clone(&shared) as Arc<dyn Counted>);
+        Self { shared, _counting: Arc::new(counting) }
     }
 
     /// Publishes a payload of at most 16 MiB, now. A message that is [`PublishOutcome::Dropped`]
@@ -119,26 +133,35 @@ impl Publisher {
     /// As [`Publisher::publish`], with the time at which the payload was measured.
     pub fn publish_at(&self, payload: Bytes, time: SystemTime) -> PublishOutcome {
         if payload.len() > MAX_PAYLOAD_BYTES {
+            self.shared.next.lock().too_large += 1;
             return PublishOutcome::TooLarge;
         }
         let since_epoch = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let deadline =
             (self.shared.lifespan > Duration::ZERO).then(|| Instant::now() + self.shared.lifespan);
-        let mut header = self.shared.next.lock();
+        let mut next = self.shared.next.lock();
+        let Next { header, dropped, too_large } = &mut *next;
         header.sequence += 1;
         header.publish_time_ns = u64::try_from(since_epoch.as_nanos()).unwrap_or(u64::MAX);
-        match Frame::new(&header, payload) {
+        match Frame::new(header, payload) {
             Ok(frame) => {
                 let outcome = self.shared.to.publish(&frame, deadline);
-                if outcome == PublishOutcome::TooLarge {
-                    // Nobody will ever see this number: subscribers must not take it for a loss.
-                    header.sequence -= 1;
+                match outcome {
+                    PublishOutcome::Taken => {}
+                    PublishOutcome::Dropped => *dropped += 1,
+                    PublishOutcome::TooLarge => {
+                        // Nobody will ever see this number: subscribers must not take it for a
+                        // loss.
+                        header.sequence -= 1;
+                        *too_large += 1;
+                    }
                 }
                 outcome
             }
             Err(error) => {
                 // The options were checked, so this is a fault of the SDK; the publisher goes on.
                 header.sequence -= 1;
+                *too_large += 1;
                 tracing::error!(
                     topic = %self.shared.topic,
                     %error,
@@ -164,7 +187,7 @@ impl Publisher {
     /// Sequence of the last message; 0 = none yet.
     #[must_use]
     pub fn sequence(&self) -> u64 {
-        self.shared.next.lock().sequence
+        self.shared.next.lock().header.sequence
     }
 
     /// Messages that were taken and have neither reached the broker nor been dropped yet.
@@ -177,6 +200,18 @@ impl Publisher {
     #[must_use]
     pub fn dropped_later(&self) -> u64 {
         self.shared.to.later().dropped()
+    }
+}
+
+impl Counted for Shared {
+    fn counts(&self) -> Counts {
+        let mut dropped = BTreeMap::from(self.to.later().by_reason());
+        let next = self.next.lock();
+        *dropped.entry(DropReason::BrokerError).or_default() += next.dropped;
+        *dropped.entry(DropReason::TooLarge).or_default() += next.too_large;
+        // One that was dropped at once has used up a sequence.
+        let given = next.header.sequence - next.dropped;
+        Counts { messages: BTreeMap::from([("publish", given)]), dropped, callbacks: None }
     }
 }
 

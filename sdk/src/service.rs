@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime};
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, BrokerError, OpenError};
 use blaze_domain::control::{Common, MAX_TTL_S};
+use blaze_domain::node_file::RedisBroker;
 use blaze_domain::{InstanceName, LayerName, NodeName, Origin, Scope, ServiceName};
 use blaze_runtime::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy};
 
@@ -13,6 +14,7 @@ use crate::broker::LocalBroker;
 use crate::cache::{CacheError, CacheManager, ServiceState, Store, WatchdogOptions};
 use crate::config::{ConfigManager, ProgramConfig};
 use crate::flow::FlowManager;
+use crate::monitor::{Endpoint, MonitorManager};
 use crate::options::ServiceOptions;
 use crate::pool::Pool;
 
@@ -99,6 +101,7 @@ pub(crate) struct Shared {
     pub(crate) pool: Pool,
     pub(crate) pool_threads: usize,
     pub(crate) supervisor: Supervisor,
+    pub(crate) monitor: MonitorManager,
 }
 
 impl Shared {
@@ -138,12 +141,10 @@ impl ServiceManager {
             })?;
         options.check_watchdog()?;
         options.check_instance()?;
-        let store = match &options.cache {
-            Some(section) => {
-                Some(Arc::new(RedisKeys::open(section).map_err(SdkError::Cache)?) as Arc<dyn Store>)
-            }
-            None => None,
-        };
+        let store = store(options.cache.as_ref())?;
+        let identity = options.identity();
+        let monitor = MonitorManager::new(&identity, &options.version)?;
+        let endpoint = Endpoint::bind(options.metrics, &monitor).await?;
         let pool_threads = match options.pool_threads {
             0 => std::thread::available_parallelism().map_or(2, usize::from),
             threads => threads,
@@ -153,6 +154,7 @@ impl ServiceManager {
         let watchdog = WatchdogOptions {
             version: options.version,
             ttl: options.watchdog_ttl,
+            metrics: monitor.address().unwrap_or_default().to_owned(),
             by_clock: options.epoch == 0,
         };
         let supervisor = match &options.supervisor {
@@ -163,18 +165,13 @@ impl ServiceManager {
             .inspect_err(|_| supervisor.shutdown_token().cancel())
             .map_err(SdkError::Threads)?;
         let shared = Arc::new(Shared {
-            identity: Identity {
-                layer: options.layer,
-                node: options.node,
-                service: options.service,
-                instance: options.instance,
-                epoch: if options.epoch == 0 { now_ms() } else { options.epoch },
-            },
+            identity,
             broker: options.broker,
             scope: options.scope,
             pool,
             pool_threads,
             supervisor,
+            monitor,
         });
         let flow = FlowManager::start(
             shared.identity.clone(),
@@ -198,6 +195,9 @@ impl ServiceManager {
             config.shown(),
             &shared.supervisor,
         );
+        if let Some(endpoint) = endpoint {
+            endpoint.serve(shared.broker.status(), cache.state(), &shared.supervisor);
+        }
         // From here on an early return ends what was started.
         let service =
             Self { broker: LocalBroker::new(Arc::clone(&shared)), shared, flow, config, cache };
@@ -249,6 +249,12 @@ impl ServiceManager {
         &self.cache
     }
 
+    /// Metrics of the service, its own and those of the SDK.
+    #[must_use]
+    pub fn monitor(&self) -> &MonitorManager {
+        &self.shared.monitor
+    }
+
     /// Who the service is.
     #[must_use]
     pub fn identity(&self) -> &Identity {
@@ -284,6 +290,13 @@ impl Drop for ServiceManager {
         // Also where no runtime is left to do it.
         self.shared.pool.stop();
     }
+}
+
+/// The Redis of the cache, where there is one.
+fn store(section: Option<&RedisBroker>) -> Result<Option<Arc<dyn Store>>, SdkError> {
+    let open = |section| RedisKeys::open(section).map_err(SdkError::Cache);
+    let keys = section.map(open).transpose()?;
+    Ok(keys.map(|keys| Arc::new(keys) as Arc<dyn Store>))
 }
 
 /// A supervisor of a service's own. Nobody else looks at it, so its failure is logged.

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use blaze_domain::ServiceName;
 use blaze_sdk::{
-    Advertise, ConfigListener, Lease, PublishOptions, Publisher, Request, ServiceManager,
-    ServiceOptions, SubscribeOptions, Subscription,
+    Advertise, ConfigListener, Lease, MetricsEndpoint, PublishOptions, Publisher, Request,
+    ServiceManager, ServiceOptions, SubscribeOptions, Subscription,
 };
 use bytes::Bytes;
 use futures::future::join_all;
@@ -68,6 +68,7 @@ impl System {
         let service_name: ServiceName = name.parse().map_err(|error| format!("{name} {error}"))?;
         let options = ServiceOptions {
             pool_threads: 2,
+            metrics: MetricsEndpoint::Off,
             ..ServiceOptions::new(id.layer.clone(), service_name, broker, scope)
         };
         let service = ServiceManager::start(options.on_node(id.node.clone()))

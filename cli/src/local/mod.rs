@@ -21,8 +21,8 @@ use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_domain::{InstanceName, Reliability, Scope, ServiceName, TopicName};
 use blaze_runtime::config::Sources;
 use blaze_sdk::{
-    FlowError, Lease, Message, Request, ServiceManager, ServiceOptions, SubscribeOptions,
-    Subscription,
+    FlowError, Lease, Message, MetricsEndpoint, Request, ServiceManager, ServiceOptions,
+    SubscribeOptions, Subscription,
 };
 use clap::Args;
 
@@ -91,6 +91,7 @@ impl LocalService {
         let options = ServiceOptions {
             instance,
             control_timeout: ANSWER_WITHIN,
+            metrics: MetricsEndpoint::Off,
             ..ServiceOptions::new(id.layer, service, Arc::clone(&broker), scope)
         };
         let manager = ServiceManager::start(options.on_node(id.node))

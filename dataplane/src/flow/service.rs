@@ -17,7 +17,8 @@ use blaze_domain::{Scope, ServiceName};
 use blaze_runtime::config::Verdict;
 use blaze_runtime::{Readiness, Supervisor, TaskPolicy};
 use blaze_sdk::{
-    CacheManager, ProgramConfig, SdkError, ServiceManager, ServiceOptions, ServiceState,
+    CacheManager, MetricsEndpoint, ProgramConfig, SdkError, ServiceManager, ServiceOptions,
+    ServiceState,
 };
 
 use super::RunningFlow;
@@ -68,6 +69,7 @@ impl FlowService {
             supervisor: Some(supervisor.clone()),
             cache,
             version: env!("CARGO_PKG_VERSION").to_owned(),
+            metrics: MetricsEndpoint::Off,
             ..options
         };
         let manager = started(options).await?;

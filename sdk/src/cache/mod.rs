@@ -99,6 +99,8 @@ pub enum Liveness {
 pub(crate) struct WatchdogOptions {
     /// Version of the program.
     pub(crate) version: String,
+    /// Where its metrics are served; empty where they are not.
+    pub(crate) metrics: String,
     /// How long a sign counts.
     pub(crate) ttl: Duration,
     /// The number of its life is the time at which it began. Clocks go back; whoever begins is the
@@ -129,6 +131,8 @@ struct Shared {
     /// What is said has changed.
     wake: Notify,
     liveness: watch::Sender<Liveness>,
+    /// The state, once there is one, for `/readyz`.
+    state: watch::Sender<Option<ServiceState>>,
 }
 
 /// How a service says that it lives, waits for others that do, and keeps values for a while.
@@ -162,6 +166,7 @@ impl CacheManager {
             }),
             wake: Notify::new(),
             liveness: watch::Sender::new(Liveness::Off),
+            state: watch::Sender::new(None),
         });
         let (running, stop) = (Arc::clone(&shared), supervisor.shutdown_token());
         supervisor.spawn("watchdog", TaskPolicy::MayEnd, async move {
@@ -187,8 +192,14 @@ impl CacheManager {
                 said.since_ms = now_ms();
             }
             said.is_on = true;
+            self.shared.state.send_replace(Some(state));
         }
         self.shared.wake.notify_one();
+    }
+
+    /// The state that was set last, and its changes.
+    pub(crate) fn state(&self) -> watch::Receiver<Option<ServiceState>> {
+        self.shared.state.subscribe()
     }
 
     /// Whether others can see that it lives, and the changes of that.

@@ -38,12 +38,14 @@ pub(super) struct Sign<'a> {
     /// Since when it is so, in ms since 1970.
     pub(super) since_ms: u64,
     pub(super) version: &'a str,
+    /// Where its metrics are served, `host:port`; empty where they are not.
+    pub(super) metrics: &'a str,
     /// Revision and hash of the configuration that it has.
     pub(super) config: Option<(u64, String)>,
 }
 
 impl Sign<'_> {
-    fn members(&self) -> [(&'static str, Value); 10] {
+    fn members(&self) -> [(&'static str, Value); 11] {
         let identity = self.identity;
         let (revision, hash) = self.config.clone().unwrap_or_default();
         [
@@ -53,6 +55,7 @@ impl Sign<'_> {
             ("instance", identity.instance.as_str().into()),
             ("state", self.state.as_str().into()),
             ("version", self.version.into()),
+            ("metrics", self.metrics.into()),
             ("epoch", self.epoch.into()),
             ("since_ms", self.since_ms.into()),
             ("config_revision", revision.into()),
@@ -142,6 +145,7 @@ mod tests {
             state: ServiceState::Ready,
             since_ms: 5,
             version: "1.2.3",
+            metrics: "127.0.0.1:9200",
             config: Some((431, "sha256:a".to_owned())),
         };
         let members = [
@@ -150,6 +154,7 @@ mod tests {
             "epoch",
             "instance",
             "layer",
+            "metrics",
             "node",
             "service",
             "since_ms",
@@ -168,7 +173,7 @@ mod tests {
             message,
             json!({"layer": "edge", "node": "robot-1", "service": "slam", "instance": "0",
                 "epoch": 17, "state": "ready",
-                "since_ms": 5, "version": "1.2.3", "config_revision": 431,
+                "since_ms": 5, "version": "1.2.3", "metrics": "127.0.0.1:9200", "config_revision": 431,
                 "config_hash": "sha256:a", "ttl_ms": 15000})
         );
         assert_eq!(key(&identity).unwrap(), "blaze:watchdog:slam:robot-1:0");

@@ -136,7 +136,12 @@ impl World {
             identity,
             broker,
             store,
-            WatchdogOptions { version: "1.2.3".to_owned(), ttl: TTL, by_clock },
+            WatchdogOptions {
+                version: "1.2.3".to_owned(),
+                metrics: String::new(),
+                ttl: TTL,
+                by_clock,
+            },
             config.shown(),
             &self.supervisor,
         )

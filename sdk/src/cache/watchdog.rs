@@ -188,6 +188,7 @@ impl Shared {
             since_ms: said.since_ms,
             epoch: self.epoch.load(Ordering::Relaxed),
             version: &self.watchdog.version,
+            metrics: &self.watchdog.metrics,
             config: record::of_config(self.config.borrow().held()),
         }
     }

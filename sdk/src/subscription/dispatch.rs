@@ -16,6 +16,7 @@ use tokio::sync::Notify;
 use super::intake::is_expired;
 use super::stats::Counters;
 use crate::Message;
+use crate::monitor::{Counted, Counts, Times};
 use crate::pool::{Job, PoolHandle};
 
 pub(crate) type Callback = Box<dyn Fn(Message) + Send + Sync>;
@@ -56,6 +57,8 @@ struct State {
     tickets: usize,
     running: usize,
     closed: bool,
+    /// How long callbacks took.
+    times: Times,
 }
 
 #[derive(Default)]
@@ -129,11 +132,13 @@ impl Dispatch {
         }
     }
 
-    fn call(&self, message: Message) {
-        let age = message.age_at(Instant::now(), SystemTime::now());
+    /// Returns how long the callback took; `None` for a message whose time was over.
+    fn call(&self, message: Message) -> Option<Duration> {
+        let begin = Instant::now();
+        let age = message.age_at(begin, SystemTime::now());
         if is_expired(age, message.lifespan(), self.limits.lifespan) {
             self.counters.expired.add(1);
-            return;
+            return None;
         }
         self.counters.delivered.add(1);
         let sequence = message.sequence();
@@ -145,6 +150,7 @@ impl Dispatch {
                 "the callback of a subscription panicked",
             );
         }
+        Some(begin.elapsed())
     }
 }
 
@@ -153,8 +159,9 @@ impl Job for Dispatch {
         let Some((writer, message)) = self.state.lock().take_next() else {
             return false;
         };
-        self.call(message);
+        let time = self.call(message);
         let mut state = self.state.lock();
+        time.into_iter().for_each(|time| state.times.add(time));
         let more = state.finish(writer, &self.limits);
         let is_idle = state.running == 0;
         drop(state);
@@ -162,6 +169,14 @@ impl Job for Dispatch {
             self.idle.notify_waiters();
         }
         more
+    }
+}
+
+impl Counted for Dispatch {
+    fn counts(&self) -> Counts {
+        let mut counts = self.counters.read().counts();
+        counts.callbacks = Some(self.state.lock().times.clone());
+        counts
     }
 }
 

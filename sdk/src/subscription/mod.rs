@@ -20,6 +20,7 @@ use intake::{Arrival, Intake};
 use stats::Counters;
 pub use stats::SubscriptionStats;
 
+use crate::monitor::{Counted, Counting};
 use crate::pool::PoolHandle;
 use crate::service::Shared;
 use crate::{Message, SdkError};
@@ -96,6 +97,7 @@ pub struct Subscription {
     dispatch: Arc<Dispatch>,
     counters: Arc<Counters>,
     ended: CancellationToken,
+    _counting: Counting,
 }
 
 impl Subscription {
@@ -173,7 +175,9 @@ pub(crate) fn start(
             () = reading.run(source) => {}
         }
     });
-    Subscription { topic: topic.clone(), dispatch, counters, ended }
+    let source = Arc::clone(&dispatch) as Arc<dyn Counted>;
+    let counting = service.monitor.topics().count(topic, source);
+    Subscription { topic: topic.clone(), dispatch, counters, ended, _counting: counting }
 }
 
 /// Takes messages from the broker until it closes.

@@ -1,6 +1,11 @@
 //! What a subscription counted.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
+
+use blaze_domain::DropReason;
+
+use crate::monitor::Counts;
 
 /// What a subscription counted since it was made, in messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -27,6 +32,23 @@ pub struct SubscriptionStats {
     pub malformed: u64,
     /// Calls of the callback that panicked.
     pub panicked: u64,
+}
+
+impl SubscriptionStats {
+    /// As metrics have it, without callbacks.
+    pub(super) fn counts(&self) -> Counts {
+        Counts {
+            messages: BTreeMap::from([("receive", self.received)]),
+            dropped: BTreeMap::from([
+                (DropReason::Duplicate, self.duplicated),
+                (DropReason::MaxRate, self.skipped),
+                (DropReason::Lifespan, self.expired),
+                (DropReason::QueueFull, self.queue_dropped),
+                (DropReason::DecodeError, self.malformed),
+            ]),
+            callbacks: None,
+        }
+    }
 }
 
 macro_rules! counters {
