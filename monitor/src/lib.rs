@@ -22,3 +22,6 @@ mod shared;
 mod subscriber;
 
 pub use shared::all_metrics;
+
+#[cfg(test)]
+mod docs_tests;

@@ -96,18 +96,30 @@ impl Histogram {
         self.counts.iter().sum()
     }
 
+    /// Sum of the values.
+    #[must_use]
+    pub fn sum(&self) -> f64 {
+        self.sum
+    }
+
+    /// Upper bounds, each with the number of values up to it.
+    pub fn buckets(&self) -> impl Iterator<Item = (f64, u64)> {
+        let sums = self.counts.iter().scan(0, |sum, count| {
+            *sum += count;
+            Some(*sum)
+        });
+        self.bounds.iter().copied().zip(sums)
+    }
+
     fn proto(&self) -> ProtoHistogram {
-        let mut out = ProtoHistogram::default();
-        let mut below = 0;
-        let mut buckets = Vec::with_capacity(self.bounds.len());
-        for (bound, count) in self.bounds.iter().zip(&self.counts) {
-            below += count;
+        let bucket = |(bound, count)| {
             let mut bucket = Bucket::default();
-            bucket.set_upper_bound(*bound);
-            bucket.set_cumulative_count(below);
-            buckets.push(bucket);
-        }
-        out.set_bucket(buckets);
+            bucket.set_upper_bound(bound);
+            bucket.set_cumulative_count(count);
+            bucket
+        };
+        let mut out = ProtoHistogram::default();
+        out.set_bucket(self.buckets().map(bucket).collect());
         out.set_sample_sum(self.sum);
         out.set_sample_count(self.count());
         out

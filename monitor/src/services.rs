@@ -95,10 +95,15 @@ fn key(sign: &Sign) -> (String, String) {
 /// Reads the records of a Redis, for ever.
 pub async fn read_records(keys: RedisKeys, node: NodeName, signs: Arc<Signs>) {
     loop {
-        match keys.records(RECORDS, MAX_SERVICES).await {
-            Ok(records) => {
-                let expires = Instant::now() + DEFAULT_TTL;
-                let of_node = records.iter().filter_map(|(_, members)| {
+        let found = match keys.records(RECORDS, MAX_SERVICES).await {
+            Ok(records) => keys.lifetimes(RECORDS, MAX_SERVICES).await.map(|left| (records, left)),
+            Err(error) => Err(error),
+        };
+        match found {
+            Ok((records, left)) => {
+                let (now, left) = (Instant::now(), left.into_iter().collect::<BTreeMap<_, _>>());
+                let of_node = records.iter().filter_map(|(key, members)| {
+                    let expires = now + left.get(key).copied().unwrap_or(DEFAULT_TTL);
                     sign(|name| members.get(name).cloned(), &node, expires)
                 });
                 signs.replace(of_node);
@@ -151,11 +156,7 @@ fn of_message(payload: &[u8], node: &NodeName) -> Option<Sign> {
 }
 
 /// The sign of a record or message; `None` where it is of another node, or is none.
-fn sign(
-    text: impl Fn(&str) -> Option<String>,
-    node: &NodeName,
-    expires: Instant,
-) -> Option<Sign> {
+fn sign(text: impl Fn(&str) -> Option<String>, node: &NodeName, expires: Instant) -> Option<Sign> {
     if text("node")? != node.as_str() {
         return None;
     }

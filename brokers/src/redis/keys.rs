@@ -324,6 +324,23 @@ impl RedisKeys {
         Ok(found)
     }
 
+    /// How long each key that begins so still lives, at most so many; keys without an end are left
+    /// out.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn lifetimes(
+        &self,
+        beginning: &str,
+        most: usize,
+    ) -> Result<Vec<(String, Duration)>, KeyError> {
+        let found = self.each::<i64>("PTTL", beginning, most, SCAN).await?;
+        let ends = found.into_iter();
+        Ok(ends
+            .filter_map(|(key, left)| Some((key, Duration::from_millis(left.try_into().ok()?))))
+            .collect())
+    }
+
     /// What a command gives for each key that begins so, asked for so many keys at a time.
     async fn each<T: FromRedisValue>(
         &self,

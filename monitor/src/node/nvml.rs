@@ -10,10 +10,10 @@ use nvml_wrapper::{Device, Nvml};
 use super::file::Fault;
 use super::limits;
 use super::metrics::{ENERGY, GPU_MEMORY, GPU_UTILIZATION, POWER, TEMPERATURE};
-use crate::metric::Metric;
 use super::sample::{Batch, Label};
 use super::sampler::Collector;
 use super::sensors::sense;
+use crate::metric::Metric;
 
 /// The name that the driver installs; the one without number comes with development packages.
 const LIBRARY: &str = "libnvidia-ml.so.1";

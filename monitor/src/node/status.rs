@@ -5,13 +5,12 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use crate::metric::Metric;
 use super::metrics::{
     BATTERY, CGROUP_THROTTLED, CLOCK_ERROR, CLOCK_SYNCHRONIZED, CPU_SECONDS, DISK, ENERGY,
-    GPU_MEMORY, GPU_UTILIZATION, MEMORY, NETWORK, NETWORK_DROPPED, POWER, TEMPERATURE,
-    UDP_ERRORS,
+    GPU_MEMORY, GPU_UTILIZATION, MEMORY, NETWORK, NETWORK_DROPPED, POWER, TEMPERATURE, UDP_ERRORS,
 };
 use super::sample::{Label, Reading, Sample, Series, State};
+use crate::metric::Metric;
 
 /// Body of `/v1/node`. What the machine lacks is absent.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]

@@ -11,15 +11,15 @@ use rand::{RngExt, SeedableRng};
 use super::answers::{Answers, Waiting};
 use super::estimate::{Now, Offset, OwnClock, RoundTrip, Sample};
 use super::ignored::{Counts, Ignored};
-use super::limits::MESSAGE_BYTES;
+use super::limits::{BUCKETS, MESSAGE_BYTES};
 use super::nodes::{Course, Nodes};
 use super::open::{OpenPing, OpenPings, Purpose};
 use super::order::{Order, OrderError, OrderId, PingSample};
 use super::other::{LinkOffset, Other};
-use super::report::Histogram;
 use super::rounds::Rounds;
 use super::topics::{TopicChanges, Topics};
 use super::wire::{Answer, Name, Ping, Pong, split, written};
+use crate::metric::Histogram;
 
 /// Settings of pings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -184,6 +184,14 @@ impl Engine {
         self.other.best(node, now, |node| self.nodes.series(node)?.clock.offset(now))
     }
 
+    /// Drops the offset to a node, which cannot be right, and measures it anew.
+    pub fn drop_offset(&mut self, now: Now, node: &FlowId) {
+        self.observe(now);
+        self.other.forget(node);
+        self.nodes.restart(node);
+        self.follow(now.monotonic);
+    }
+
     /// Messages, answers and nodes that were ignored for a reason.
     #[must_use]
     pub fn ignored(&self, reason: Ignored) -> u64 {
@@ -322,7 +330,8 @@ impl Engine {
         };
         if let Some(series) = self.nodes.series_mut(from) {
             series.add(sample, now);
-            let layer = self.layers.entry(from.layer.clone()).or_default();
+            let layer = self.layers.entry(from.layer.clone());
+            let layer = layer.or_insert_with(|| Histogram::new(&BUCKETS));
             layer.observe(sample.latency_s());
         }
         if let Some(order) = &mut self.order {

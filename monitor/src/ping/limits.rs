@@ -67,5 +67,5 @@ pub(super) const ORDER_WARM_UP: Duration = Duration::from_secs(5);
 /// Between two pings of that wait.
 pub(super) const ORDER_WARM_INTERVAL: Duration = Duration::from_millis(500);
 /// Upper bounds of the latency histogram's buckets, in seconds: from a wire to a satellite.
-pub(super) const BUCKETS: [f64; 11] =
+pub(super) static BUCKETS: [f64; 11] =
     [0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5];

@@ -30,9 +30,7 @@ pub use estimate::{Now, Offset, Source};
 pub use ignored::Ignored;
 pub use order::{OrderError, OrderId, PingSample};
 pub use other::LinkOffset;
-pub use report::{
-    Histogram, LatencyView, METRICS, Metric, MetricKind, NodeView, PingView, Reading, Value,
-};
+pub use report::{LatencyView, METRICS, NodeView, PingView, Reading, Value};
 pub use topics::TopicChanges;
 
 #[cfg(test)]

@@ -7,8 +7,8 @@ use serde::Serialize;
 
 use super::engine::Engine;
 use super::estimate::{Now, Source};
-use super::limits::BUCKETS;
 use super::nodes::Series;
+use crate::metric::{Histogram, Metric, metrics};
 
 /// Body of `/v1/ping`, without the names of the node and the time.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -53,68 +53,28 @@ pub struct LatencyView {
     pub p99: Option<f64>,
 }
 
-/// Kind of a metric.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MetricKind {
-    /// Grows only.
-    Counter,
-    /// Goes up and down.
-    Gauge,
-    /// Counts by upper bounds.
-    Histogram,
+metrics! {
+    LATENCY Gauge "blaze_ping_latency_seconds" ["to_layer", "to_node"] "seconds"
+        "Time on one way to the node in the last ping."
+    SENT Counter "blaze_ping_sent_total" ["to_layer", "to_node"] "1"
+        "Pings sent to the node."
+    LOST Counter "blaze_ping_lost_total" ["to_layer", "to_node"] "1"
+        "Pings without an answer of the node in 5 s."
+    LAYER_LATENCY Histogram "blaze_ping_layer_latency_seconds" ["to_layer"] "seconds"
+        "Time on one way to the nodes of the layer."
+    OFFSET Gauge "blaze_clock_offset_seconds" ["to_layer", "to_node"] "seconds"
+        "Clock of the node minus the clock here."
+    OFFSET_ERROR Gauge "blaze_clock_offset_error_seconds" ["to_layer", "to_node"] "seconds"
+        "Largest error of the offset to the node's clock."
+    IGNORED Counter "blaze_ping_ignored_total" ["reason"] "1"
+        "Messages of pings, answers and nodes that were ignored."
 }
-
-/// What a metric is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Metric {
-    /// Full name.
-    pub name: &'static str,
-    /// Its kind.
-    pub kind: MetricKind,
-    /// One sentence for `# HELP`.
-    pub help: &'static str,
-    /// Names of its labels, in order.
-    pub labels: &'static [&'static str],
-}
-
-const fn of_node(name: &'static str, kind: MetricKind, help: &'static str) -> Metric {
-    Metric { name, kind, help, labels: &["to_layer", "to_node"] }
-}
-
-const LATENCY: &str = "blaze_ping_latency_seconds";
-const SENT: &str = "blaze_ping_sent_total";
-const LOST: &str = "blaze_ping_lost_total";
-const LAYER_LATENCY: &str = "blaze_ping_layer_latency_seconds";
-const OFFSET: &str = "blaze_clock_offset_seconds";
-const OFFSET_ERROR: &str = "blaze_clock_offset_error_seconds";
-const IGNORED: &str = "blaze_ping_ignored_total";
-
-/// Metrics of pings.
-pub const METRICS: [Metric; 7] = [
-    of_node(LATENCY, MetricKind::Gauge, "Time on one way to the node in the last ping."),
-    of_node(SENT, MetricKind::Counter, "Pings sent to the node."),
-    of_node(LOST, MetricKind::Counter, "Pings without an answer of the node in 5 s."),
-    Metric {
-        name: LAYER_LATENCY,
-        kind: MetricKind::Histogram,
-        help: "Time on one way to the nodes of the layer.",
-        labels: &["to_layer"],
-    },
-    of_node(OFFSET, MetricKind::Gauge, "Clock of the node minus the clock here."),
-    of_node(OFFSET_ERROR, MetricKind::Gauge, "Largest error of the offset to the node's clock."),
-    Metric {
-        name: IGNORED,
-        kind: MetricKind::Counter,
-        help: "Messages of pings, answers and nodes that were ignored.",
-        labels: &["reason"],
-    },
-];
 
 /// One value of a metric.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Reading {
-    /// Name of the metric.
-    pub metric: &'static str,
+    /// The metric.
+    pub metric: &'static Metric,
     /// Labels in the order of the table.
     pub labels: Vec<(&'static str, String)>,
     /// Its value.
@@ -128,45 +88,6 @@ pub enum Value {
     Number(f64),
     /// Of a histogram.
     Histogram(Histogram),
-}
-
-/// Latencies counted by upper bounds, in seconds.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Histogram {
-    /// Per bound, and those above all bounds.
-    counts: [u64; BUCKETS.len() + 1],
-    sum: f64,
-}
-
-impl Histogram {
-    pub(super) fn observe(&mut self, seconds: f64) {
-        let slot = BUCKETS.iter().take_while(|bound| seconds > **bound).count();
-        if let Some(count) = self.counts.get_mut(slot) {
-            *count += 1;
-        }
-        self.sum += seconds;
-    }
-
-    /// Upper bounds in seconds, each with the number of values up to it.
-    pub fn buckets(&self) -> impl Iterator<Item = (f64, u64)> {
-        let sums = self.counts.iter().scan(0, |sum, count| {
-            *sum += count;
-            Some(*sum)
-        });
-        BUCKETS.into_iter().zip(sums)
-    }
-
-    /// Number of values.
-    #[must_use]
-    pub fn count(&self) -> u64 {
-        self.counts.iter().sum()
-    }
-
-    /// Sum of the values, in seconds.
-    #[must_use]
-    pub fn sum(&self) -> f64 {
-        self.sum
-    }
 }
 
 impl Engine {
@@ -204,12 +125,12 @@ impl Engine {
         let nodes = self.nodes.asked();
         let nodes = nodes.flat_map(move |(node, series)| self.node_readings(node, series, now));
         let layers = self.layers.iter().map(|(layer, histogram)| Reading {
-            metric: LAYER_LATENCY,
+            metric: &LAYER_LATENCY,
             labels: vec![("to_layer", layer.to_string())],
             value: Value::Histogram(histogram.clone()),
         });
         let ignored = self.ignored.iter().map(|(reason, count)| Reading {
-            metric: IGNORED,
+            metric: &IGNORED,
             labels: vec![("reason", reason.as_str().to_owned())],
             value: Value::Number(count as f64),
         });
@@ -219,11 +140,11 @@ impl Engine {
     fn node_readings(&self, node: &FlowId, series: &Series, now: Now) -> Vec<Reading> {
         let offset = self.offset(node, now);
         let values = [
-            (LATENCY, series.latencies.back().copied()),
-            (SENT, Some(series.sent as f64)),
-            (LOST, Some(series.lost as f64)),
-            (OFFSET, offset.map(|offset| offset.offset_s)),
-            (OFFSET_ERROR, offset.map(|offset| offset.error_s)),
+            (&LATENCY, series.latencies.back().copied()),
+            (&SENT, Some(series.sent as f64)),
+            (&LOST, Some(series.lost as f64)),
+            (&OFFSET, offset.map(|offset| offset.offset_s)),
+            (&OFFSET_ERROR, offset.map(|offset| offset.error_s)),
         ];
         let labels = vec![("to_layer", node.layer.to_string()), ("to_node", node.node.to_string())];
         let readings = values.into_iter().filter_map(|(metric, value)| {

@@ -7,6 +7,7 @@ use serde_json::{Value as Json, json};
 
 use super::testing::{MS, Net, S, TestClock, at, node};
 use super::*;
+use crate::metric::Kind;
 
 fn engine(period_s: u64) -> Engine {
     let settings = Settings { period: Duration::from_secs(period_s) };
@@ -412,10 +413,10 @@ fn the_view_and_the_metrics_are_those_of_the_contract() {
     }
     let readings: Vec<Reading> = net.engines[0].metrics(now).collect();
     for metric in METRICS {
-        let reading = readings.iter().find(|reading| reading.metric == metric.name).unwrap();
+        let reading = readings.iter().find(|reading| reading.metric.name == metric.name).unwrap();
         assert!(reading.labels.iter().map(|(name, _)| name).eq(metric.labels), "{reading:?}");
         let is_histogram = matches!(reading.value, Value::Histogram(_));
-        assert_eq!(is_histogram, metric.kind == MetricKind::Histogram);
+        assert_eq!(is_histogram, metric.kind == Kind::Histogram);
     }
     let histogram = readings.iter().find_map(|reading| match &reading.value {
         Value::Histogram(histogram) => Some(histogram),
