@@ -27,6 +27,27 @@ pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// [`CliError::CannotConnect`], [`CliError::Refused`] for any status but 200, [`CliError::Answer`]
 /// for what is no JSON object or too large.
 pub async fn get_json(address: &FlowAddress, path: &str) -> Result<Value, CliError> {
+    let body = get(address, path).await?;
+    let unexpected = |reason: String| CliError::Answer { address: address.to_string(), reason };
+    let value: Value =
+        serde_json::from_slice(&body).map_err(|error| unexpected(format!("no JSON: {error}")))?;
+    if value.is_object() {
+        Ok(value)
+    } else {
+        Err(unexpected("the answer is no JSON object".to_owned()))
+    }
+}
+
+/// The same for text, as that of metrics; what is no UTF-8 is replaced.
+///
+/// # Errors
+/// As [`get_json`].
+pub(crate) async fn get_text(address: &FlowAddress, path: &str) -> Result<String, CliError> {
+    let body = get(address, path).await?;
+    Ok(String::from_utf8_lossy(&body).into_owned())
+}
+
+async fn get(address: &FlowAddress, path: &str) -> Result<Bytes, CliError> {
     let cannot = |reason: String| CliError::CannotConnect { address: address.to_string(), reason };
     let stream =
         timeout(CONNECT_TIMEOUT, TcpStream::connect((address.host.as_str(), address.port)))
@@ -43,14 +64,7 @@ pub async fn get_json(address: &FlowAddress, path: &str) -> Result<Value, CliErr
             detail: detail_of(&body),
         });
     }
-    let unexpected = |reason: String| CliError::Answer { address: address.to_string(), reason };
-    let value: Value =
-        serde_json::from_slice(&body).map_err(|error| unexpected(format!("no JSON: {error}")))?;
-    if value.is_object() {
-        Ok(value)
-    } else {
-        Err(unexpected("the answer is no JSON object".to_owned()))
-    }
+    Ok(body)
 }
 
 async fn exchange(
@@ -64,7 +78,7 @@ async fn exchange(
         .map_err(|error| unexpected(error.to_string()))?;
     let request = Request::get(path)
         .header(HOST, address.to_string())
-        .header(ACCEPT, "application/json")
+        .header(ACCEPT, "application/json, text/plain")
         .body(Empty::<Bytes>::new())
         .map_err(|error| CliError::Failed(format!("the request cannot be made: {error}")))?;
     let answer = async {
