@@ -128,7 +128,8 @@ fn udp(listen: Ipv4Addr, port: u16) -> Bind {
 /// Keys that name one port.
 fn same_ports<const N: usize>(ports: [(&str, SocketAddr); N]) -> Vec<Finding> {
     let mut keys: BTreeMap<SocketAddr, Vec<&str>> = BTreeMap::new();
-    for (key, address) in ports {
+    // With port 0 the system gives each another one.
+    for (key, address) in ports.into_iter().filter(|(_, address)| address.port() > 0) {
         keys.entry(address).or_default().push(key);
     }
     let double = keys.into_iter().filter(|(_, keys)| keys.len() > 1);

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! node file ─► file ─► Node ─┬► programs: admin ports of flow, worker, monitor, main service
-//!                            ├► file, brokers, network, mtu, flows, machine, credentials
+//!                            ├► file, brokers, network, mtu, peers, flows, sync, machine, credentials
 //!                            │    probe ─► facts ─► judgement ─► Finding
 //!                            └► Check: the worst of the findings ─► output
 //! ```
@@ -19,7 +19,9 @@ mod limits;
 mod machine;
 mod mtu;
 mod network;
+mod peers;
 mod programs;
+mod sync;
 
 use std::path::PathBuf;
 
@@ -82,16 +84,16 @@ const CHECKS: [(&str, Probe); 18] = [
     ("mtu", |node| Box::pin(mtu::mtu(node))),
     ("udp_buffers", |node| Box::pin(network::udp_buffers(node))),
     ("clock", |node| Box::pin(async { machine::clock(node) })),
-    ("peers", |node| Box::pin(flows::peers(node))),
+    ("peers", |node| Box::pin(peers::peers(node))),
     ("versions", |node| Box::pin(async { flows::versions(node) })),
     ("leases", |node| Box::pin(async { flows::leases(node) })),
     ("budget", |node| Box::pin(flows::budget(node))),
     ("token", |node| Box::pin(credentials::token(node))),
     ("certificates", |node| Box::pin(credentials::certificates(node))),
-    ("config_sync", |node| Box::pin(async { flows::config_sync(node) })),
+    ("config_sync", |node| Box::pin(async { sync::config_sync(node) })),
     ("disk", |node| Box::pin(machine::disk(node))),
     ("descriptors", |node| Box::pin(machine::descriptors(node))),
-    ("collectors", |node| Box::pin(async { flows::collectors(node) })),
+    ("collectors", |node| Box::pin(async { sync::collectors(node) })),
 ];
 
 /// Examines this node: done if no check fails, else failed.

@@ -12,6 +12,7 @@ use rustix::net::sockopt::{Ipv4PathMtuDiscovery, ip_mtu, set_ip_mtu_discover};
 
 use super::check::{Finding, named};
 use super::limits::{MTU_ANSWER, MTU_PEERS, MTU_TRIES};
+use super::programs::rows;
 use super::{Node, on_thread};
 
 /// First port of traceroute: hosts have nothing there, and answer that.
@@ -84,8 +85,10 @@ async fn seen_peers(node: &Node) -> Vec<Ipv4Addr> {
         return Vec::new();
     }
     let answer = node.flow.get("/v1/peers").await.unwrap_or_default();
-    let rows = answer["peers"].as_array().map_or(&[][..], Vec::as_slice);
-    rows.iter().filter_map(|row| super::flows::address(row["address"].as_str()?)).collect()
+    rows(&answer, "peers")
+        .iter()
+        .filter_map(|row| super::peers::address(row["address"].as_str()?))
+        .collect()
 }
 
 fn path(listen: Ipv4Addr, peer: Ipv4Addr, mtu: usize) -> Path {

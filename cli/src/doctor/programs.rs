@@ -155,6 +155,22 @@ impl Program {
     }
 }
 
+/// The entries of a list in an answer.
+pub(super) fn rows<'v>(value: &'v Value, name: &str) -> &'v [Value] {
+    value[name].as_array().map_or(&[][..], Vec::as_slice)
+}
+
+/// A text in an answer; empty where there is none.
+pub(super) fn text<'v>(value: &'v Value, name: &str) -> &'v str {
+    value[name].as_str().unwrap_or_default()
+}
+
+/// A program that runs, and does not answer what it should.
+pub(super) fn unanswered(program: Kind, reason: &str) -> Finding {
+    let name = program.program();
+    Finding::warn(format!("{name} gives no answer: {reason}"), "see the check ports")
+}
+
 /// Labels and values of a metric in the text format of Prometheus.
 fn sample_lines<'m>(text: &'m str, metric: &'m str) -> impl Iterator<Item = (&'m str, f64)> {
     text.lines().filter_map(move |line| {
