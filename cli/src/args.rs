@@ -10,6 +10,7 @@ use crate::admin::TopOptions;
 use crate::config::ConfigCommand;
 use crate::demo::options::DemoOptions;
 use crate::dev::options::DevOptions;
+use crate::doctor::DoctorOptions;
 use crate::local::{CallOptions, EchoOptions, HzOptions, PublishOptions};
 use crate::output::Output;
 use crate::plan::PlanOptions;
@@ -49,6 +50,9 @@ pub enum Command {
     Why(WhyOptions),
     /// The rate that each topic would get at each destination, from a file of flows and topics
     Plan(PlanOptions),
+    /// What is wrong with this node, and what to do: node file, ports, brokers, network, clock, peers,
+    /// tokens, disk, …; exits with 1 if a check fails
+    Doctor(DoctorOptions),
     /// Publish on a topic, as a service on the local broker
     Pub(PublishOptions),
     /// Print the messages of a topic, as a service on the local broker

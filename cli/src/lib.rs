@@ -5,6 +5,7 @@
 //!      ├─► plan: plan file ──► allocator of the data plane ──► output
 //!      ├─► config: get, apply, watch, … ──► REST of the main service of BlazeConfig ──► output
 //!      ├─► local: pub, echo, hz, call ──► local broker of the node file
+//!      ├─► doctor: node file, programs, brokers, network, machine ──► checks ──► output
 //!      ├─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
 //!      └─► dev: main service, worker and flow of one node in one process
 //! ```
@@ -14,6 +15,7 @@ pub mod args;
 pub mod config;
 pub mod demo;
 pub mod dev;
+pub mod doctor;
 mod embedded;
 mod ends;
 pub mod exit;
@@ -71,6 +73,7 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
         Command::Top(options) => admin::top(&options, format?).await,
         Command::Why(why) => admin::why(&why, format?).await,
         Command::Plan(options) => plan::run(&options, format?),
+        Command::Doctor(options) => doctor::run(options, format?).await,
         Command::Pub(options) => local::publish(options, format?).await,
         Command::Echo(options) => local::echo(options, format?).await,
         Command::Hz(options) => local::hz(options, format?).await,

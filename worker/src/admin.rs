@@ -169,6 +169,7 @@ fn text_of(worker: &RunningWorker, status: &Status) -> String {
     let (connected, leader) = (is("connected"), is("leader"));
     let [main, copy, file] = ["main", "copy", "file"].map(|word| u8::from(json["source"] == word));
     let (revision, unwatched) = (status.revision, status.unwatched);
+    let version = env!("CARGO_PKG_VERSION");
     let age = json["age_s"].as_f64().unwrap_or(f64::NAN);
     let SpeakerCounts { notices, replaced, waiting, .. } = worker.speaker();
     let Counts {
@@ -193,7 +194,10 @@ fn text_of(worker: &RunningWorker, status: &Status) -> String {
     let failures = of("blaze_worker_copy_failures_total", |copy| copy.failed);
     let current = of("blaze_worker_copy_current", |copy| u64::from(copy.is_current));
     format!(
-        r#"# HELP blaze_worker_connected 1 while there is a stream from the main service.
+        r#"# HELP blaze_build_info 1, with the version as label.
+# TYPE blaze_build_info gauge
+blaze_build_info{{version="{version}",program="blaze-worker"}} 1
+# HELP blaze_worker_connected 1 while there is a stream from the main service.
 # TYPE blaze_worker_connected gauge
 blaze_worker_connected {connected}
 # HELP blaze_worker_leader 1 while this worker answers and notifies for its layer or node.

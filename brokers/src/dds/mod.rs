@@ -65,7 +65,8 @@ fn multicast_port(domain: u16) -> u16 {
 }
 
 /// UDP port on which the participant in a slot takes announcements.
-fn announcement_port(domain: u16, slot: u16) -> u16 {
+#[must_use]
+pub fn announcement_port(domain: u16, slot: u16) -> u16 {
     multicast_port(domain) + 10 + 2 * slot
 }
 

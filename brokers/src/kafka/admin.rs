@@ -101,6 +101,18 @@ impl Admin {
             .collect())
     }
 
+    /// Topics whose names begin with the prefix, but for those of Kafka itself.
+    pub(super) fn topics(
+        &self,
+        prefix: &str,
+        within: Duration,
+    ) -> Result<Vec<Arc<str>>, KafkaError> {
+        let metadata = self.0.inner().fetch_metadata(None, within)?;
+        let names = metadata.topics().iter().map(rdkafka::metadata::MetadataTopic::name);
+        let ours = names.filter(|name| name.starts_with(prefix) && !name.starts_with("__"));
+        Ok(ours.map(Arc::from).collect())
+    }
+
     /// The largest batches that the server takes of topics, in bytes; of those that it tells.
     pub(super) fn largest_batches(
         &self,

@@ -16,6 +16,7 @@ mod clock;
 mod consumer;
 mod context;
 mod directory;
+mod examine;
 #[cfg(test)]
 mod fake_broker;
 mod flow_side;
@@ -54,6 +55,7 @@ use crate::port::{
     PublisherOptions, Role, StatusCell, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
+pub use examine::{LARGEST_RECORD, narrow_topics};
 pub use group_lease::{GroupLease, GroupLeaseOptions};
 
 use directory::Directory;

@@ -14,6 +14,7 @@
 //! missing.
 
 mod connection;
+mod examine;
 mod flow_side;
 mod gate;
 mod kept;
@@ -45,9 +46,11 @@ use redis::aio::MultiplexedConnection;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+pub use examine::{RedisReport, examine};
 pub use gate::MAX_QUEUE_BYTES;
 pub use keys::{KeyChange, KeyError, Record, RedisKeys};
 pub use lock::RedisLock;
+pub use server::Complaint;
 
 use crate::open::OpenError;
 use crate::outbox::LanePublisher;
@@ -192,7 +195,7 @@ impl Shared {
         let complaints = [facts.complaint(), limits.and_then(BufferLimits::complaint)];
         if complaints != [None, None] && !self.warned.swap(true, Ordering::Relaxed) {
             for complaint in complaints.into_iter().flatten() {
-                tracing::warn!(complaint, "redis is set up so that something gets lost");
+                tracing::warn!(%complaint, "redis is set up so that something gets lost");
             }
         }
         self.state.change(|conditions| {

@@ -1,6 +1,7 @@
 //! What the server says of itself, and how its answers are read.
 
 use std::collections::HashMap;
+use std::fmt;
 use std::time::Duration;
 
 use redis::aio::MultiplexedConnection;
@@ -13,6 +14,23 @@ use crate::port::BrokerError;
 const LEAST_HARD_LIMIT: u64 = 4 * 32 * 1024 * 1024;
 /// The same for the limit that holds for some seconds: two of the largest messages.
 const LEAST_SOFT_LIMIT: u64 = 2 * 16 * 1024 * 1024;
+
+/// A setting of the server with which something gets lost.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Complaint {
+    /// What it is now, and what is lost.
+    pub detail: String,
+    /// Name of the setting.
+    pub setting: &'static str,
+    /// The value that it should have.
+    pub value: &'static str,
+}
+
+impl fmt::Display for Complaint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}; set `{} {}`", self.detail, self.setting, self.value)
+    }
+}
 
 /// What `INFO` tells.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -40,12 +58,16 @@ impl ServerFacts {
     }
 
     /// What is to be changed, if it may throw away what is kept on it.
-    pub(super) fn complaint(&self) -> Option<String> {
+    pub(super) fn complaint(&self) -> Option<Complaint> {
         let policy = self.memory_policy.as_deref().filter(|policy| *policy != "noeviction")?;
-        Some(format!(
-            "maxmemory-policy is {policy}: where memory is full, leases, retained messages, \
-             configurations and signs of life vanish; set `maxmemory-policy noeviction`"
-        ))
+        Some(Complaint {
+            detail: format!(
+                "maxmemory-policy is {policy}: where memory is full, leases, retained messages, \
+                 configurations and signs of life vanish"
+            ),
+            setting: "maxmemory-policy",
+            value: "noeviction",
+        })
     }
 }
 
@@ -66,15 +88,16 @@ impl BufferLimits {
     }
 
     /// What is to be changed, if large messages would get a reader cut off.
-    pub(super) fn complaint(self) -> Option<String> {
+    pub(super) fn complaint(self) -> Option<Complaint> {
         let low = |limit: u64, least: u64| limit != 0 && limit < least;
-        (low(self.hard, LEAST_HARD_LIMIT) || low(self.soft, LEAST_SOFT_LIMIT)).then(|| {
-            format!(
+        (low(self.hard, LEAST_HARD_LIMIT) || low(self.soft, LEAST_SOFT_LIMIT)).then(|| Complaint {
+            detail: format!(
                 "client-output-buffer-limit is `pubsub {} {} {}`: the server closes readers of \
-                 large messages; set \
-                 `client-output-buffer-limit pubsub 256mb 128mb 60`",
+                 large messages",
                 self.hard, self.soft, self.soft_seconds
-            )
+            ),
+            setting: "client-output-buffer-limit",
+            value: "pubsub 256mb 128mb 60",
         })
     }
 }
@@ -140,7 +163,7 @@ mod tests {
         assert_eq!(facts(valkey).version, "valkey 9.1.2");
         assert_eq!(facts("").version, "redis");
         let policy = |name: &str| facts(&format!("maxmemory_policy:{name}\r\n")).complaint();
-        assert!(policy("allkeys-lru").unwrap().contains("allkeys-lru"));
+        assert!(policy("allkeys-lru").unwrap().detail.contains("allkeys-lru"));
         assert_eq!(policy("noeviction").or(facts("").complaint()), None);
     }
 
@@ -148,7 +171,7 @@ mod tests {
     fn low_buffer_limits_are_named() {
         let default = "normal 0 0 0 slave 268435456 67108864 60 pubsub 33554432 8388608 60";
         let limits = BufferLimits::parse(default).unwrap();
-        assert!(limits.complaint().unwrap().contains("pubsub 33554432 8388608 60"));
+        assert!(limits.complaint().unwrap().detail.contains("pubsub 33554432 8388608 60"));
         for good in ["pubsub 268435456 134217728 60", "normal 0 0 0 pubsub 0 0 0"] {
             assert_eq!(BufferLimits::parse(good).unwrap().complaint(), None, "{good}");
         }

@@ -12,6 +12,7 @@
 
 mod cuts;
 mod dds_namespaces;
+mod doctor;
 mod layers;
 mod long;
 mod loss;

@@ -7,5 +7,6 @@ mod admin;
 mod apply_wait;
 mod dev;
 mod dev_flow;
+mod doctor;
 mod node_join;
 mod stage;
