@@ -55,7 +55,10 @@ pub async fn serve(
     Ok(address)
 }
 
-async fn series(State(shared): App, Query(query): Query<BTreeMap<String, String>>) -> Json<Value> {
+async fn series(
+    State(shared): App,
+    Query(query): Query<BTreeMap<String, String>>,
+) -> Json<Value> {
     Json(shared.series(query.get("names").map_or("", String::as_str)))
 }
 
@@ -81,9 +84,7 @@ fn fifth_of_a_second() -> u64 {
 async fn ping(State(shared): App, body: axum::body::Bytes) -> Response {
     let order: Order = match serde_json::from_slice(&body) {
         Ok(order) => order,
-        Err(error) => {
-            return refusal(StatusCode::BAD_REQUEST, "invalid_request", &error.to_string());
-        }
+        Err(error) => return refusal(StatusCode::BAD_REQUEST, "invalid_request", &error.to_string()),
     };
     let Ok(to) = order.to.parse() else {
         let detail = format!("to: {:?} is no LAYER/NODE, such as fog/fog-1", order.to);
@@ -154,10 +155,9 @@ fn asked(shared: &Shared) -> Vec<(String, Labels)> {
         let labels = name.map(|name| ("flow", name.to_string())).into_iter();
         (flow.address.clone(), [program("blaze-flow")].into_iter().chain(labels).collect())
     });
-    let worker = programs
-        .worker
-        .is_reachable
-        .then(|| (shared.live().worker.clone(), vec![program("blaze-worker")]));
+    let worker = programs.worker.is_reachable.then(|| {
+        (shared.live().worker.clone(), vec![program("blaze-worker")])
+    });
     let signs = shared.signs.now(Instant::now()).unwrap_or_default();
     let services = signs.into_iter().filter_map(|sign| {
         // Elsewhere it would be somebody else's port: who may write a sign of life decides where

@@ -147,9 +147,7 @@ fn config_state(own: &FlowId, sign: &Sign, worker: &WorkerView) -> ConfigState {
     let rows = worker.status.as_ref().and_then(|status| status["services"].as_array());
     let is_same = |row: &&Value| {
         let is_here = row["node"].is_null() || row["node"] == own.node.as_str();
-        is_here
-            && row["service"] == sign.service.as_str()
-            && row["instance"] == sign.instance.as_str()
+        is_here && row["service"] == sign.service.as_str() && row["instance"] == sign.instance.as_str()
     };
     let Some(row) = rows.and_then(|rows| rows.iter().find(is_same)) else {
         return ConfigState::Unknown;
@@ -179,7 +177,9 @@ pub fn vitals(of_node: node::Vitals, offsets: Vec<OffsetInput>) -> Vitals {
         disks: of_node.disks,
         memory_available: of_node.memory_ratio,
         hottest: of_node.celsius_max,
-        clock_error_s: of_node.clock_error_s.filter(|_| of_node.clock_synchronized == Some(true)),
+        clock_error_s: of_node
+            .clock_error_s
+            .filter(|_| of_node.clock_synchronized == Some(true)),
         offsets,
         udp_buffer_errors: of_node.udp_buffer_errors_total,
         throttled_s: of_node.cgroup_throttled_s_total,
@@ -198,7 +198,9 @@ mod tests {
             "advertised": [{"rate_hz": 50.0, "local": true, "priority": null},
                            {"rate_hz": 10.0, "local": false}],
             "requested": [{"service": "log"}]});
-        let bridge = |topic: &str, class: Value, drops: u64| json!({"topic": topic, "class": class, "dropped": {"queue_full": drops}});
+        let bridge = |topic: &str, class: Value, drops: u64| {
+            json!({"topic": topic, "class": class, "dropped": {"queue_full": drops}})
+        };
         let bridges = [
             bridge("imu/data", json!(null), 1),
             bridge("imu/data", json!("state"), 2),

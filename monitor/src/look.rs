@@ -29,7 +29,8 @@ pub async fn run(shared: Arc<Shared>) {
         let is_closer = began >= next_closer;
         let settings = shared.live();
         let before = shared.programs();
-        let programs = Programs::look(&settings.flows, &settings.worker, &before, is_closer).await;
+        let programs =
+            Programs::look(&settings.flows, &settings.worker, &before, is_closer).await;
         seen.note(&programs);
         if is_closer {
             follow_flows(&shared, &programs).await;
@@ -73,8 +74,7 @@ async fn follow_flows(shared: &Shared, programs: &Programs) {
         engine.set_measured(now, measured);
         engine.set_links(now, own.into_iter().flat_map(offsets));
         let relayed = others.into_iter();
-        engine
-            .set_relayed(now, relayed.filter_map(|flow| Some((flow.name.clone()?, offsets(flow)))));
+        engine.set_relayed(now, relayed.filter_map(|flow| Some((flow.name.clone()?, offsets(flow)))));
     });
 }
 
@@ -137,3 +137,4 @@ fn judge(shared: &Shared, programs: &Programs, seen: &Seen) {
     let inputs = gather::inputs(&shared.me, programs, (expected, seen), signs, vitals);
     shared.judge(&inputs);
 }
+

@@ -153,11 +153,12 @@ fn outside_of_values(text: &str) -> impl Iterator<Item = (usize, u8)> {
 
 /// The labels with one of a name renamed.
 fn renamed(labels: &str, name: &str) -> String {
-    let starts = std::iter::once(0)
-        .chain(outside_of_values(labels).filter(|(_, byte)| *byte == b',').map(|(at, _)| at + 1));
-    let clash = starts
-        .map(|at| (at, &labels[at..]))
-        .find(|(_, rest)| rest.strip_prefix(name).is_some_and(|rest| rest.starts_with('=')));
+    let starts = std::iter::once(0).chain(
+        outside_of_values(labels).filter(|(_, byte)| *byte == b',').map(|(at, _)| at + 1),
+    );
+    let clash = starts.map(|at| (at, &labels[at..])).find(|(_, rest)| {
+        rest.strip_prefix(name).is_some_and(|rest| rest.starts_with('='))
+    });
     match clash {
         Some((at, rest)) => format!("{}exported_{rest}", &labels[..at]),
         None => labels.to_owned(),

@@ -117,7 +117,8 @@ async fn addresses(flows: &[String]) -> Vec<String> {
 
 async fn look_at_flow(address: String, before: Option<&FlowView>, is_closer: bool) -> FlowView {
     let before = before.cloned().unwrap_or_default();
-    let (summary, ready) = tokio::join!(json(&address, "/v1/summary", ANSWER), readiness(&address));
+    let (summary, ready) =
+        tokio::join!(json(&address, "/v1/summary", ANSWER), readiness(&address));
     let summary = match summary {
         Ok(summary) => summary,
         Err(away) => return FlowView { address, name: before.name, away, ..FlowView::default() },
@@ -152,8 +153,7 @@ async fn look_at_flow(address: String, before: Option<&FlowView>, is_closer: boo
 async fn blocked(address: &str) -> Vec<Value> {
     let topics = rows(address, "/v1/topics?state=blocked", "topics").await;
     let names = topics.iter().filter(|row| row["state"] == "blocked");
-    let names: Vec<&str> =
-        names.filter_map(|row| row["topic"].as_str()).take(MAX_BLOCKED).collect();
+    let names: Vec<&str> = names.filter_map(|row| row["topic"].as_str()).take(MAX_BLOCKED).collect();
     futures::stream::iter(names)
         .map(|topic| async move {
             json(address, &format!("/v1/why?topic={topic}"), ANSWER).await.ok()
@@ -301,15 +301,14 @@ mod tests {
         let is_ready = ready(true, body.as_bytes());
         assert_eq!(is_ready.detail, "");
         assert_eq!(is_ready.config_fault.as_deref(), Some("blaze.yaml:3: no"));
-        assert_eq!(
-            ready(true, b"no json"),
-            Ready { is_reachable: true, is_ready: true, ..Ready::default() }
-        );
+        assert_eq!(ready(true, b"no json"), Ready { is_reachable: true, is_ready: true, ..Ready::default() });
     }
 
     #[test]
     fn only_links_that_are_up_give_an_offset() {
-        let peer = |flow: &str, state: &str, offset: Value| json!({"flow": flow, "state": state, "clock_offset_ms": offset, "clock_error_ms": 2.0});
+        let peer = |flow: &str, state: &str, offset: Value| {
+            json!({"flow": flow, "state": state, "clock_offset_ms": offset, "clock_error_ms": 2.0})
+        };
         let offsets = link_offsets(&[
             peer("fog/fog-1", "up", json!(-3000.0)),
             peer("fog/fog-2", "down", json!(1.0)),

@@ -151,7 +151,11 @@ fn of_message(payload: &[u8], node: &NodeName) -> Option<Sign> {
 }
 
 /// The sign of a record or message; `None` where it is of another node, or is none.
-fn sign(text: impl Fn(&str) -> Option<String>, node: &NodeName, expires: Instant) -> Option<Sign> {
+fn sign(
+    text: impl Fn(&str) -> Option<String>,
+    node: &NodeName,
+    expires: Instant,
+) -> Option<Sign> {
     if text("node")? != node.as_str() {
         return None;
     }

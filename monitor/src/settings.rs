@@ -110,13 +110,9 @@ mod tests {
             "admin": {"flow": "0.0.0.0:9101", "worker": "[::]:9102"},
             "config": {"server": "https://main:50051", "token_file": "/t"},
         })));
-        assert_eq!(
-            (live.flows[0].as_str(), live.worker.as_str()),
-            ("127.0.0.1:9101", "[::1]:9102")
-        );
+        assert_eq!((live.flows[0].as_str(), live.worker.as_str()), ("127.0.0.1:9101", "[::1]:9102"));
         assert_eq!(live.main.unwrap().server, "https://main:50051");
-        let silent =
-            json!({"monitor": {"report": false}, "config": {"server": "http://127.0.0.1:1"}});
+        let silent = json!({"monitor": {"report": false}, "config": {"server": "http://127.0.0.1:1"}});
         assert_eq!(LiveSettings::of(&file(&silent)).main, None);
     }
 

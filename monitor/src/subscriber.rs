@@ -11,7 +11,9 @@ use blaze_sdk::{FlowManager, LocalBroker, Message, Request, SubscribeOptions};
 use parking_lot::Mutex;
 use tokio_util::task::AbortOnDropHandle;
 
-use crate::latency::{Latency, Message as Measured, Offset, header_stamp_cdr, header_stamp_json};
+use crate::latency::{
+    Latency, Message as Measured, Offset, header_stamp_cdr, header_stamp_json,
+};
 use crate::limits::{LATENCY_QUEUE, MAX_LATENCY_TOPICS};
 use crate::pings::{Pings, until_held};
 

@@ -32,8 +32,7 @@ use crate::supervisor::{Supervisor, TaskHandle, TaskPolicy, say};
 pub type MetricsText = Arc<dyn Fn() -> String + Send + Sync>;
 
 /// Makes of the program's own page of metrics the one with `?all=1`.
-pub type AllMetrics =
-    Arc<dyn Fn(String) -> Pin<Box<dyn Future<Output = String> + Send>> + Send + Sync>;
+pub type AllMetrics = Arc<dyn Fn(String) -> Pin<Box<dyn Future<Output = String> + Send>> + Send + Sync>;
 
 /// What the port allows.
 #[derive(Debug, Clone)]

@@ -45,10 +45,7 @@ pub(super) fn router(
 pub(super) fn with_all_metrics(router: Router, all: AllMetrics) -> Router {
     router.layer(middleware::from_fn(move |request: Request, next: Next| {
         let asks_for_all = request.uri().path() == "/metrics"
-            && request
-                .uri()
-                .query()
-                .is_some_and(|query| query.split('&').any(|one| one == "all=1"));
+            && request.uri().query().is_some_and(|query| query.split('&').any(|one| one == "all=1"));
         let all = Arc::clone(&all);
         async move {
             let response = next.run(request).await;

@@ -57,7 +57,9 @@ impl MainService {
     ///
     /// # Errors
     /// An address or a file that cannot be used, and a main service that does not answer.
-    pub async fn connect(&self) -> Result<(Channel, Option<MetadataValue<Ascii>>), ConnectError> {
+    pub async fn connect(
+        &self,
+    ) -> Result<(Channel, Option<MetadataValue<Ascii>>), ConnectError> {
         let connecting = async {
             let token = token(self).await?;
             Ok((channel(self).await?, token))
