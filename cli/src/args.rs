@@ -7,11 +7,12 @@ use blaze_domain::{LayerName, NodeName, ServiceName, TopicName};
 use clap::{Args, Parser, Subcommand};
 
 use crate::admin::TopOptions;
-use crate::config::ConfigCommand;
+use crate::config::{ConfigCommand, ServerOptions};
 use crate::demo::options::DemoOptions;
 use crate::dev::options::DevOptions;
 use crate::doctor::DoctorOptions;
 use crate::local::{CallOptions, EchoOptions, HzOptions, PublishOptions};
+use crate::monitor::{LatencyOptions, PingOptions, ProblemsOptions};
 use crate::output::Output;
 use crate::plan::PlanOptions;
 
@@ -44,10 +45,17 @@ pub enum Command {
     Peers(FlowTarget),
     /// Endpoints of a flow's ROS 2 network, and why one is not bridged
     Ros2(FlowTarget),
-    /// What each lane carries beside what it was allocated, once a second
+    /// What each lane carries beside what it was allocated, once a second; or the nodes of the
+    /// system, or the topics or bridges of a flow
     Top(TopOptions),
     /// Why a topic does or does not arrive; exits with 0 if it flows
     Why(WhyOptions),
+    /// Latency and clock of other nodes, as the monitor of this node sees them
+    Ping(PingOptions),
+    /// Latency of a topic's messages, as the monitor of this node measures it
+    Latency(LatencyOptions),
+    /// What is wrong on this node, or with --server in the whole system, and what to do
+    Problems(ProblemsOptions),
     /// The rate that each topic would get at each destination, from a file of flows and topics
     Plan(PlanOptions),
     /// What is wrong with this node, and what to do: node file, ports, brokers, network, clock, peers,
@@ -93,9 +101,15 @@ pub struct WhyOptions {
     /// Where it should arrive
     #[arg(long, value_name = "LAYER[/NODE[/SERVICE]]")]
     pub to: Option<Destination>,
+    /// Where it is published; with --server alone
+    #[arg(long, value_name = "LAYER[/NODE[/SERVICE]]")]
+    pub from: Option<Destination>,
     /// Which flow to ask.
     #[command(flatten)]
     pub target: FlowTarget,
+    /// Ask the main service instead, which asks the flows of both ends.
+    #[command(flatten)]
+    pub server: ServerOptions,
 }
 
 pub(crate) fn parse_topic(text: &str) -> Result<TopicName, String> {
@@ -143,14 +157,24 @@ impl From<std::net::SocketAddr> for FlowAddress {
 impl FromStr for FlowAddress {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
+        Self::parse(text, 9101)
+    }
+}
+
+impl FlowAddress {
+    /// Reads an address; the port is the one that is suggested where there is none.
+    ///
+    /// # Errors
+    /// In words.
+    pub(crate) fn parse(text: &str, usual: u16) -> Result<Self, String> {
         let bare = text.strip_prefix("http://").unwrap_or(text).trim_end_matches('/');
         let (host, port) = bare
             .rsplit_once(':')
-            .ok_or_else(|| format!("it needs a port; did you mean {bare}:9101?"))?;
+            .ok_or_else(|| format!("it needs a port; did you mean {bare}:{usual}?"))?;
         let host = match host.strip_prefix('[') {
             Some(rest) => rest.strip_suffix(']').ok_or("the bracket is not closed")?,
             None if host.contains(':') => {
-                return Err(format!("an IPv6 address stands in brackets: [{bare}]:9101"));
+                return Err(format!("an IPv6 address stands in brackets: [{bare}]:{usual}"));
             }
             None => host,
         };
@@ -200,6 +224,7 @@ impl fmt::Display for Destination {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::admin::View;
     use clap::CommandFactory as _;
 
     pub(crate) fn parse(line: &str) -> Result<Arguments, clap::Error> {
@@ -240,6 +265,20 @@ pub(crate) mod tests {
         for line in ["-o json why imu/data", "why imu/data -o json"] {
             assert_eq!(parse(line).unwrap().output, Output::Json);
         }
+    }
+
+    #[test]
+    fn top_shows_lanes_unless_a_word_says_otherwise() {
+        for (line, view) in [
+            ("top --interval 2 --count 1", None),
+            ("top nodes --server http://127.0.0.1:1", Some(View::Nodes)),
+            ("top topics --flow a:1", Some(View::Topics)),
+            ("top bridges", Some(View::Bridges)),
+        ] {
+            let Command::Top(options) = parse(line).unwrap().command else { panic!("{line}") };
+            assert_eq!(options.view, view, "{line}");
+        }
+        assert!(parse("top lanes").unwrap_err().to_string().contains("[possible values: nodes"));
     }
 
     #[test]

@@ -7,6 +7,7 @@ use blaze_domain::control::{ControlError, ErrorCode};
 use serde_json::{Value, json};
 
 use crate::config::Refusal;
+use crate::http::Program;
 
 /// Exit codes; part of the contract.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,11 +69,10 @@ pub enum CliError {
     #[error("{0}")]
     Usage(String),
     /// Nobody answers at the address.
-    #[error(
-        "no flow answers at {address}: {reason}\n  A flow names its admin port in its line `ready \
-         admin=HOST:PORT`; give it with --flow HOST:PORT."
-    )]
+    #[error("no {program} answers at {address}: {reason}\n  {}", program.advice())]
     CannotConnect {
+        /// Which program should answer.
+        program: Program,
         /// Where it was tried.
         address: String,
         /// What the system or the deadline said.
@@ -103,8 +103,10 @@ pub enum CliError {
         detail: String,
     },
     /// The answer is not what the contract says.
-    #[error("{address} answers, but not as a flow does: {reason}")]
+    #[error("{address} answers, but not as a {program} does: {reason}")]
     Answer {
+        /// Which program should answer.
+        program: Program,
         /// Who answered.
         address: String,
         /// What is wrong.

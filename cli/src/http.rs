@@ -1,8 +1,9 @@
 //! How the command line asks admin ports.
 
+use std::fmt;
 use std::time::Duration;
 
-use blaze_runtime::http::{GetError, GetLimits, get};
+use blaze_runtime::http::{GetError, GetLimits, get, post};
 use serde_json::Value;
 
 use crate::args::FlowAddress;
@@ -15,29 +16,97 @@ pub const LIMITS: GetLimits = GetLimits {
     bytes: 16 * 1024 * 1024,
 };
 
-/// Gets one JSON object. `path` begins with a slash and may have a query; it is sent as it is.
+/// Which program has the admin port.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Program {
+    /// blaze-flow.
+    Flow,
+    /// blaze-monitor.
+    Monitor,
+}
+
+impl fmt::Display for Program {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Flow => "flow",
+            Self::Monitor => "monitor",
+        })
+    }
+}
+
+impl Program {
+    /// What to do where it does not answer.
+    #[must_use]
+    pub fn advice(self) -> &'static str {
+        match self {
+            Self::Flow => {
+                "A flow names its admin port in its line `ready admin=HOST:PORT`; give it with \
+                 --flow HOST:PORT."
+            }
+            Self::Monitor => {
+                "Start it with `blaze-monitor --config FILE`; --monitor HOST:PORT names another \
+                 one (admin.monitor of its node file)."
+            }
+        }
+    }
+}
+
+/// Gets one JSON object of a flow. `path` begins with a slash and may have a query; it is sent as
+/// it is.
 ///
 /// # Errors
 /// [`CliError::CannotConnect`], [`CliError::Refused`] for any status but 200, [`CliError::Answer`]
 /// for what is no JSON object or too large.
 pub async fn get_json(address: &FlowAddress, path: &str) -> Result<Value, CliError> {
-    let unexpected = |reason: String| CliError::Answer { address: address.to_string(), reason };
     let answer = get(&address.to_string(), path, LIMITS).await;
+    object(Program::Flow, address, answer)
+}
+
+/// Gets one JSON object of a monitor.
+///
+/// # Errors
+/// As [`get_json`].
+pub async fn get_of_monitor(address: &FlowAddress, path: &str) -> Result<Value, CliError> {
+    let answer = get(&address.to_string(), path, LIMITS).await;
+    object(Program::Monitor, address, answer)
+}
+
+/// Posts JSON to a monitor, which may take so long to answer.
+///
+/// # Errors
+/// As [`get_json`].
+pub async fn post_to_monitor(
+    address: &FlowAddress,
+    path: &str,
+    body: &Value,
+    answer_within: Duration,
+) -> Result<Value, CliError> {
+    let limits = GetLimits { answer: answer_within, ..LIMITS };
+    let answer = post(&address.to_string(), path, body.to_string().into(), limits).await;
+    object(Program::Monitor, address, answer)
+}
+
+fn object(
+    program: Program,
+    address: &FlowAddress,
+    answer: Result<(u16, impl AsRef<[u8]>), GetError>,
+) -> Result<Value, CliError> {
+    let address = address.to_string();
+    let unexpected =
+        |reason: String| CliError::Answer { program, address: address.clone(), reason };
     let (status, body) = answer.map_err(|error| match error {
         GetError::Unreachable(reason) => {
-            CliError::CannotConnect { address: address.to_string(), reason }
+            CliError::CannotConnect { program, address: address.clone(), reason }
         }
         GetError::Answer(reason) => unexpected(reason),
     })?;
+    let body = body.as_ref();
     if status != 200 {
-        return Err(CliError::Refused {
-            address: address.to_string(),
-            status,
-            detail: detail_of(&body),
-        });
+        let detail = detail_of(body);
+        return Err(CliError::Refused { address, status, detail });
     }
     let value: Value =
-        serde_json::from_slice(&body).map_err(|error| unexpected(format!("no JSON: {error}")))?;
+        serde_json::from_slice(body).map_err(|error| unexpected(format!("no JSON: {error}")))?;
     if value.is_object() {
         Ok(value)
     } else {

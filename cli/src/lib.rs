@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! args ──► admin: topics, bridges, peers, top, why ──► http ──► admin port of a flow ──► output
+//!      ├─► monitor: ping, latency, problems ──► http ──► admin port of a monitor ──► output
 //!      ├─► plan: plan file ──► allocator of the data plane ──► output
 //!      ├─► config: get, apply, watch, … ──► REST of the main service of BlazeConfig ──► output
 //!      ├─► local: pub, echo, hz, call ──► local broker of the node file
@@ -21,6 +22,7 @@ mod ends;
 pub mod exit;
 pub mod http;
 pub mod local;
+pub mod monitor;
 mod node_file;
 pub mod output;
 pub mod plan;
@@ -72,6 +74,9 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
         Command::Peers(target) => admin::peers(&target.flow, format?).await,
         Command::Top(options) => admin::top(&options, format?).await,
         Command::Why(why) => admin::why(&why, format?).await,
+        Command::Ping(options) => monitor::ping(&options, format?).await,
+        Command::Latency(options) => monitor::latency(&options, format?).await,
+        Command::Problems(options) => monitor::problems(&options, format?).await,
         Command::Plan(options) => plan::run(&options, format?),
         Command::Doctor(options) => doctor::run(options, format?).await,
         Command::Pub(options) => local::publish(options, format?).await,

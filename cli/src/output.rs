@@ -1,6 +1,6 @@
 //! Tables for people, JSON and YAML for programs.
 
-use std::io::Write;
+use std::io::{IsTerminal as _, Write};
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use serde_json::Value;
@@ -144,6 +144,29 @@ pub fn format_object(
             yaml_serde::to_string(value).map_err(|error| CliError::Failed(error.to_string()))
         }
     }
+}
+
+/// Prints a value that is looked at again and again: a table replaces the one before where standard
+/// output is a terminal, JSON is one line, YAML a document.
+///
+/// # Errors
+/// As [`print`] and [`format_object`].
+pub fn print_look(
+    value: &Value,
+    format: Format,
+    table: impl FnOnce(&Value) -> Result<String, CliError>,
+) -> Result<(), CliError> {
+    let text = match format {
+        Format::Json => value.to_string(),
+        Format::Table | Format::Yaml => format_object(value, format, table)?,
+    };
+    let begin = match format {
+        // Home, and clear what is below.
+        Format::Table if std::io::stdout().is_terminal() => "\x1b[H\x1b[J",
+        Format::Yaml => "---\n",
+        Format::Table | Format::Json => "",
+    };
+    print(&format!("{begin}{text}"))
 }
 
 /// Bytes with a binary unit: `921.6 KB` would be wrong here, `900.0 KiB` is meant.

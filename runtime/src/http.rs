@@ -1,17 +1,17 @@
-//! One GET over plain HTTP, with deadlines and a largest answer: how programs of a node and the
-//! command line ask admin ports.
+//! One GET or POST over plain HTTP, with deadlines and a largest answer: how programs of a node and
+//! the command line ask admin ports.
 
 use std::time::Duration;
 
 use axum::body::Bytes;
-use http_body_util::{BodyExt as _, Empty, Limited};
-use hyper::Request;
-use hyper::header::{ACCEPT, HOST};
+use http_body_util::{BodyExt as _, Full, Limited};
+use hyper::header::{ACCEPT, CONTENT_TYPE, HOST};
+use hyper::{Method, Request};
 use hyper_util::rt::TokioIo;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-/// What a GET may take.
+/// What a request may take.
 #[derive(Debug, Clone, Copy)]
 pub struct GetLimits {
     /// For the connection.
@@ -39,6 +39,30 @@ pub enum GetError {
 /// # Errors
 /// No answer within the limits.
 pub async fn get(address: &str, path: &str, limits: GetLimits) -> Result<(u16, Bytes), GetError> {
+    ask(address, (Method::GET, path, None), limits).await
+}
+
+/// As [`get`], with a POST of JSON.
+///
+/// # Errors
+/// As [`get`].
+pub async fn post(
+    address: &str,
+    path: &str,
+    json: Bytes,
+    limits: GetLimits,
+) -> Result<(u16, Bytes), GetError> {
+    ask(address, (Method::POST, path, Some(json)), limits).await
+}
+
+/// Method, path and query, JSON to send.
+type Question<'q> = (Method, &'q str, Option<Bytes>);
+
+async fn ask(
+    address: &str,
+    question: Question<'_>,
+    limits: GetLimits,
+) -> Result<(u16, Bytes), GetError> {
     let late = |what: &str, within: Duration| {
         GetError::Unreachable(format!("no {what} within {} s", within.as_secs_f64()))
     };
@@ -46,7 +70,7 @@ pub async fn get(address: &str, path: &str, limits: GetLimits) -> Result<(u16, B
         .await
         .map_err(|_| late("connection", limits.connect))?
         .map_err(|error| GetError::Unreachable(error.to_string()))?;
-    timeout(limits.answer, exchange(stream, address, path, limits.bytes))
+    timeout(limits.answer, exchange(stream, address, question, limits.bytes))
         .await
         .map_err(|_| late("answer", limits.answer))?
 }
@@ -54,17 +78,24 @@ pub async fn get(address: &str, path: &str, limits: GetLimits) -> Result<(u16, B
 async fn exchange(
     stream: TcpStream,
     address: &str,
-    path: &str,
+    (method, path, json): Question<'_>,
     most: usize,
 ) -> Result<(u16, Bytes), GetError> {
     let unexpected = |reason: String| GetError::Answer(reason);
     let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
         .await
         .map_err(|error| unexpected(error.to_string()))?;
-    let request = Request::get(path)
+    let request = Request::builder()
+        .method(method)
+        .uri(path)
         .header(HOST, address)
-        .header(ACCEPT, "application/json")
-        .body(Empty::<Bytes>::new())
+        .header(ACCEPT, "application/json");
+    let request = match &json {
+        Some(_) => request.header(CONTENT_TYPE, "application/json"),
+        None => request,
+    };
+    let request = request
+        .body(Full::new(json.unwrap_or_default()))
         .map_err(|error| unexpected(format!("the request cannot be made: {error}")))?;
     let answer = async {
         let response =

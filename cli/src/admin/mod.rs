@@ -1,24 +1,27 @@
 //! Commands that ask a flow.
 
 mod bridges;
+mod nodes;
 mod peers;
 mod ros2;
 mod top;
 mod topics;
 mod why;
+mod why_hops;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize as _, Deserializer};
 use serde_json::Value;
 
-use crate::args::{FlowAddress, WhyOptions};
+use crate::args::{Destination, FlowAddress, WhyOptions};
+use crate::config::client::Client;
 use crate::exit::{CliError, Exit};
-use crate::http::get_json;
+use crate::http::{Program, get_json};
 use crate::output::{self, Format, terminal_width};
 
 pub(crate) use bridges::dropped_text;
 pub use bridges::{Bridge, Bridges, DroppedBefore, Place};
-pub use top::TopOptions;
+pub use top::{TopOptions, View};
 
 /// `blaze topics`.
 ///
@@ -63,8 +66,16 @@ pub async fn top(options: &TopOptions, format: Format) -> Result<Exit, CliError>
 /// `blaze why`: done if the topic flows, even if degraded; else failed.
 ///
 /// # Errors
-/// As [`topics`].
+/// As [`topics`]; of the main service what it refuses.
 pub async fn why(options: &WhyOptions, format: Format) -> Result<Exit, CliError> {
+    if options.server.is_given() {
+        return why_of_server(options, format).await;
+    }
+    if options.from.is_some() {
+        return Err(CliError::Usage(
+            "--from is for the main service, which knows all flows: give --server URL".to_owned(),
+        ));
+    }
     let flow = &options.target.flow;
     let mut path = format!("/v1/why?topic={}", options.topic);
     if let Some(to) = &options.to {
@@ -79,6 +90,17 @@ pub async fn why(options: &WhyOptions, format: Format) -> Result<Exit, CliError>
         suggest_topic(flow, options.topic.as_str()).await;
     }
     Ok(if answer.flows() { Exit::Done } else { Exit::Failed })
+}
+
+async fn why_of_server(options: &WhyOptions, format: Format) -> Result<Exit, CliError> {
+    let client = Client::of(&options.server)?;
+    let text = |end: &Option<Destination>| end.as_ref().map(Destination::to_string);
+    let answer = client.why(options.topic.as_str(), text(&options.to), text(&options.from));
+    let value = answer.await?;
+    let why = why_hops::Why::deserialize(&value).map_err(|error| client.odd(error.to_string()))?;
+    let text = output::format_object(&value, format, |_| Ok(why_hops::text(&why)))?;
+    output::print(&text)?;
+    Ok(if why.verdict.flows() { Exit::Done } else { Exit::Failed })
 }
 
 /// Nobody publishes the topic: perhaps it is called something else.
@@ -121,8 +143,23 @@ async fn show(
 /// # Errors
 /// [`CliError::Answer`] where a field is missing or of another kind.
 pub fn typed<T: DeserializeOwned>(flow: &FlowAddress, value: &Value) -> Result<T, CliError> {
-    T::deserialize(value)
-        .map_err(|error| CliError::Answer { address: flow.to_string(), reason: error.to_string() })
+    typed_of(Program::Flow, flow, value)
+}
+
+/// As [`typed`], of any program.
+///
+/// # Errors
+/// As [`typed`].
+pub(crate) fn typed_of<T: DeserializeOwned>(
+    program: Program,
+    address: &FlowAddress,
+    value: &Value,
+) -> Result<T, CliError> {
+    T::deserialize(value).map_err(|error| CliError::Answer {
+        program,
+        address: address.to_string(),
+        reason: error.to_string(),
+    })
 }
 
 /// A text that may be missing or `null`: then it is empty.

@@ -1,14 +1,16 @@
-//! `blaze top`: what each lane carries beside what it was allocated, again and again.
+//! `blaze top`: what each lane carries beside what it was allocated, or nodes, topics, bridges,
+//! again and again.
 
-use std::io::IsTerminal as _;
 use std::time::Duration;
 
 use clap::Args;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::{heading, typed};
+use super::{bridges, heading, nodes, topics, typed};
 use crate::args::{FlowAddress, FlowTarget, parse_seconds};
+use crate::config::ServerOptions;
+use crate::config::client::Client;
 use crate::exit::{CliError, Exit};
 use crate::http::get_json;
 use crate::output::{self, Align, Format, bytes, number, terminal_width};
@@ -16,6 +18,9 @@ use crate::output::{self, Align, Format, bytes, number, terminal_width};
 /// Options of `blaze top`.
 #[derive(Debug, Args)]
 pub struct TopOptions {
+    /// What to show; without it: the lanes of a flow
+    #[arg(value_enum)]
+    pub view: Option<View>,
     /// Which flow to ask.
     #[command(flatten)]
     pub target: FlowTarget,
@@ -25,6 +30,26 @@ pub struct TopOptions {
     /// End after this many looks
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
+    /// Which main service to ask for the nodes.
+    #[command(flatten)]
+    pub server: ServerOptions,
+}
+
+impl TopOptions {
+    fn interval(&self) -> Duration {
+        Duration::from_secs_f64(self.interval)
+    }
+}
+
+/// What `blaze top` shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum View {
+    /// All nodes of the system, from the main service
+    Nodes,
+    /// Topics that a flow knows
+    Topics,
+    /// Bridges of a flow
+    Bridges,
 }
 
 #[derive(Debug, Deserialize)]
@@ -86,29 +111,47 @@ struct Link {
 /// What [`get_json`] says, or an answer that is not as the contract says.
 pub(super) async fn run(options: &TopOptions, format: Format) -> Result<Exit, CliError> {
     let flow = &options.target.flow;
+    let width = terminal_width;
+    match options.view {
+        None => {
+            let look = || get_json(flow, "/v1/allocation");
+            looks(options, format, look, |value| table(flow, value, width())).await
+        }
+        Some(View::Topics) => {
+            let look = || get_json(flow, "/v1/topics");
+            looks(options, format, look, |value| topics::table(flow, value, width())).await
+        }
+        Some(View::Bridges) => {
+            let look = || get_json(flow, "/v1/bridges");
+            looks(options, format, look, |value| bridges::table(flow, value, width())).await
+        }
+        Some(View::Nodes) => {
+            let client = Client::of(&options.server)?;
+            let look = || client.fleet(options.interval());
+            looks(options, format, look, |value| Ok(nodes::table(value, width()))).await
+        }
+    }
+}
+
+async fn looks<F: Future<Output = Result<Value, CliError>>>(
+    options: &TopOptions,
+    format: Format,
+    look: impl Fn() -> F,
+    table: impl Fn(&Value) -> Result<String, CliError>,
+) -> Result<Exit, CliError> {
     let mut looks = 0;
     loop {
         let value = tokio::select! {
-            value = get_json(flow, "/v1/allocation") => value?,
+            value = look() => value?,
             _ = tokio::signal::ctrl_c() => return Ok(Exit::Done),
         };
-        let text = match format {
-            Format::Json => value.to_string(),
-            Format::Table | Format::Yaml => {
-                output::format_object(&value, format, |value| table(flow, value, terminal_width()))?
-            }
-        };
-        let replaces = format == Format::Table && std::io::stdout().is_terminal();
-        // Home, and clear what is below.
-        let begin = if replaces { "\x1b[H\x1b[J" } else { "" };
-        let between = if format == Format::Yaml { "---\n" } else { "" };
-        output::print(&format!("{begin}{between}{text}"))?;
+        output::print_look(&value, format, &table)?;
         looks += 1;
         if options.count.is_some_and(|count| looks >= count) {
             return Ok(Exit::Done);
         }
         tokio::select! {
-            () = tokio::time::sleep(Duration::from_secs_f64(options.interval)) => {}
+            () = tokio::time::sleep(options.interval()) => {}
             _ = tokio::signal::ctrl_c() => return Ok(Exit::Done),
         }
     }

@@ -18,10 +18,26 @@ pub(super) struct Why {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Verdict {
+pub(super) enum Verdict {
     Flowing,
     Degraded,
     NotFlowing,
+}
+
+impl Verdict {
+    /// Whether messages arrive, be it fewer or weaker than asked.
+    pub(super) fn flows(self) -> bool {
+        self != Self::NotFlowing
+    }
+
+    /// The first line for people; `what` is the topic and where it should arrive.
+    pub(super) fn sentence(self, what: &str, code: &str) -> String {
+        match self {
+            Self::Flowing => format!("{what} is flowing\n"),
+            Self::Degraded => format!("{what} is flowing, but not as asked ({code})\n"),
+            Self::NotFlowing => format!("{what} is NOT flowing ({code})\n"),
+        }
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -38,7 +54,7 @@ struct Step {
 impl Why {
     /// Whether messages arrive, be it fewer or weaker than asked.
     pub(super) fn flows(&self) -> bool {
-        self.verdict != Verdict::NotFlowing
+        self.verdict.flows()
     }
 }
 
@@ -48,13 +64,7 @@ pub(super) fn text(why: &Why) -> String {
         Some(Value::String(to)) if !to.is_empty() => format!(" to {to}"),
         _ => String::new(),
     };
-    let mut text = match why.verdict {
-        Verdict::Flowing => format!("{}{to} is flowing\n", why.topic),
-        Verdict::Degraded => {
-            format!("{}{to} is flowing, but not as asked ({})\n", why.topic, why.code)
-        }
-        Verdict::NotFlowing => format!("{}{to} is NOT flowing ({})\n", why.topic, why.code),
-    };
+    let mut text = why.verdict.sentence(&format!("{}{to}", why.topic), &why.code);
     let width = |part: fn(&Step) -> &str| {
         why.steps.iter().map(|step| part(step).chars().count()).max().unwrap_or(0)
     };

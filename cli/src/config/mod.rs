@@ -30,6 +30,7 @@ mod fleet;
 mod get;
 mod history;
 mod kinds;
+mod monitoring;
 pub(crate) mod node;
 mod options;
 mod patch;
@@ -39,7 +40,7 @@ pub(crate) mod seed;
 mod sse;
 mod stream;
 #[cfg(test)]
-mod stub;
+pub(crate) mod stub;
 mod tables;
 pub(crate) mod text;
 mod tls;

@@ -36,6 +36,15 @@ pub struct ServerOptions {
     pub client_key: Option<PathBuf>,
 }
 
+impl ServerOptions {
+    /// Whether the command line names a server, or how to reach one.
+    #[must_use]
+    pub fn is_given(&self) -> bool {
+        let files = [&self.token_file, &self.ca_file, &self.client_cert, &self.client_key];
+        self.server.is_some() || self.context.is_some() || files.iter().any(|file| file.is_some())
+    }
+}
+
 /// One document.
 #[derive(Debug, Clone, Args)]
 pub struct DocumentOptions {

@@ -10,6 +10,7 @@ use tokio::task::JoinSet;
 
 use super::client::Client;
 use super::endpoint::{Endpoint, Token, TokenSource, parse_server};
+use crate::args::FlowAddress;
 
 /// A request as it came.
 #[derive(Debug, Clone, PartialEq)]
@@ -120,6 +121,11 @@ impl Stub {
     /// What it was asked so far, as `GET /path?query`.
     pub(crate) fn lines(&self) -> Vec<String> {
         self.asked.lock().iter().map(Asked::line).collect()
+    }
+
+    /// It as an admin port.
+    pub(crate) fn admin(&self) -> FlowAddress {
+        self.url.parse().unwrap()
     }
 
     /// A client of it, without a token.

@@ -1,4 +1,4 @@
-//! `blaze pub`, `echo`, `hz` and `call`: the command line as a service on the local broker of a node
+//! `blaze pub`, `echo`, `hz`, `call` and `latency --subscribe`: the command line as a service on the local broker of a node
 //! file.
 //!
 //! ```text
@@ -9,6 +9,8 @@
 mod call;
 mod echo;
 mod hz;
+mod latency;
+mod meter;
 mod publish;
 mod types;
 
@@ -33,6 +35,7 @@ use crate::node_file;
 pub use call::{CallOptions, run as call};
 pub use echo::{EchoOptions, run as echo};
 pub use hz::{HzOptions, run as hz};
+pub(crate) use latency::run as latency;
 pub use publish::{PublishOptions, run as publish};
 
 /// How long a broker may take to answer.
