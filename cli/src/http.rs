@@ -86,27 +86,52 @@ pub async fn post_to_monitor(
     object(Program::Monitor, address, answer)
 }
 
+/// Gets text of a flow, such as its metrics; what is no UTF-8 is replaced.
+///
+/// # Errors
+/// As [`get_json`].
+pub(crate) async fn get_text(address: &FlowAddress, path: &str) -> Result<String, CliError> {
+    let answer = get(&address.to_string(), path, LIMITS).await;
+    let body = body_of(Program::Flow, address, answer)?;
+    Ok(String::from_utf8_lossy(body.as_ref()).into_owned())
+}
+
+fn body_of<B>(
+    program: Program,
+    address: &FlowAddress,
+    answer: Result<(u16, B), GetError>,
+) -> Result<B, CliError>
+where
+    B: AsRef<[u8]>,
+{
+    let address = address.to_string();
+    let (status, body) = answer.map_err(|error| match error {
+        GetError::Unreachable(reason) => {
+            CliError::CannotConnect { program, address: address.clone(), reason }
+        }
+        GetError::Answer(reason) => {
+            CliError::Answer { program, address: address.clone(), reason }
+        }
+    })?;
+    match status {
+        200 => Ok(body),
+        _ => Err(CliError::Refused { address, status, detail: detail_of(body.as_ref()) }),
+    }
+}
+
 fn object(
     program: Program,
     address: &FlowAddress,
     answer: Result<(u16, impl AsRef<[u8]>), GetError>,
 ) -> Result<Value, CliError> {
-    let address = address.to_string();
-    let unexpected =
-        |reason: String| CliError::Answer { program, address: address.clone(), reason };
-    let (status, body) = answer.map_err(|error| match error {
-        GetError::Unreachable(reason) => {
-            CliError::CannotConnect { program, address: address.clone(), reason }
-        }
-        GetError::Answer(reason) => unexpected(reason),
-    })?;
-    let body = body.as_ref();
-    if status != 200 {
-        let detail = detail_of(body);
-        return Err(CliError::Refused { address, status, detail });
-    }
-    let value: Value =
-        serde_json::from_slice(body).map_err(|error| unexpected(format!("no JSON: {error}")))?;
+    let body = body_of(program, address, answer)?;
+    let unexpected = |reason: String| CliError::Answer {
+        program,
+        address: address.to_string(),
+        reason,
+    };
+    let value: Value = serde_json::from_slice(body.as_ref())
+        .map_err(|error| unexpected(format!("no JSON: {error}")))?;
     if value.is_object() {
         Ok(value)
     } else {
