@@ -144,7 +144,8 @@ impl ConfigService {
             doubtful: false,
         };
         // Only a bad name could fail, and a test makes them.
-        let metrics = StatusMetrics::new().map_err(|error| StoreError::Refused(error.to_string()))?;
+        let metrics =
+            StatusMetrics::new().map_err(|error| StoreError::Refused(error.to_string()))?;
         let watches = Arc::new(Watches {
             store: Arc::clone(&options.store),
             log: Arc::clone(&log),

@@ -268,9 +268,8 @@ impl Fleet {
             self.layers.insert(layer, health);
         }
         let nodes = &self.nodes;
-        self.entries.retain(|node, entry| {
-            nodes.get(node).is_some_and(|(layer, _)| *layer == entry.layer)
-        });
+        self.entries
+            .retain(|node, entry| nodes.get(node).is_some_and(|(layer, _)| *layer == entry.layer));
     }
 
     /// The layer of a node, by the configuration.

@@ -103,8 +103,7 @@ impl<T: Ord + Copy> Damped<T> {
         let worse = seen > self.value;
         let (since, least) = match &self.pending {
             Some(pending) if pending.worse == worse => {
-                let least =
-                    if worse { pending.least.min(seen) } else { pending.least.max(seen) };
+                let least = if worse { pending.least.min(seen) } else { pending.least.max(seen) };
                 (pending.since, least)
             }
             _ => (now.at, seen),

@@ -124,9 +124,8 @@ impl Interest {
             _ => Some((period, until)),
         };
         let (period, _) = self.wanted?;
-        let is_known = self
-            .sent
-            .is_some_and(|(sent, at)| sent == period && now < at + RENEW_INTEREST);
+        let is_known =
+            self.sent.is_some_and(|(sent, at)| sent == period && now < at + RENEW_INTEREST);
         if is_known {
             return None;
         }
@@ -211,8 +210,7 @@ impl Hub {
             let detail = format!("a monitor of node {node} that started later reports");
             return Err((Refusal::OlderEpoch, Problem::new(Code::RevisionConflict, detail)));
         }
-        let entered =
-            inner.fleet.enter(node, &hello.layer, hello.metrics_address.clone(), now);
+        let entered = inner.fleet.enter(node, &hello.layer, hello.metrics_address.clone(), now);
         entered.map_err(|error| {
             let problem = Problem::new(Code::Overloaded, error.to_string()).retry_after(30);
             (Refusal::TooManyNodes, problem)
@@ -372,10 +370,8 @@ impl Session {
         })?;
         let mut inner = self.hub.inner.lock();
         // A stream that was replaced says nothing any more.
-        let is_newest = inner
-            .lines
-            .get(&self.node)
-            .is_some_and(|line| line.connection == self.line.connection);
+        let is_newest =
+            inner.lines.get(&self.node).is_some_and(|line| line.connection == self.line.connection);
         if !is_newest || !inner.fleet.report(&self.node, report) {
             return Err(Refusal::OlderEpoch);
         }
@@ -399,10 +395,8 @@ impl Session {
 impl Drop for Session {
     fn drop(&mut self) {
         let mut inner = self.hub.inner.lock();
-        let is_own = inner
-            .lines
-            .get(&self.node)
-            .is_some_and(|line| line.connection == self.line.connection);
+        let is_own =
+            inner.lines.get(&self.node).is_some_and(|line| line.connection == self.line.connection);
         if is_own {
             inner.lines.remove(&self.node);
             self.hub.metrics.streams(inner.lines.len());
@@ -411,4 +405,3 @@ impl Drop for Session {
         self.line.close("the stream has ended");
     }
 }
-

@@ -73,6 +73,12 @@ impl StatusMetrics {
         self.queries.with_label_values(&[result]).inc();
     }
 
+    /// How often something was refused for a reason.
+    #[cfg(test)]
+    pub(crate) fn count(&self, reason: &str) -> u64 {
+        self.refused.with_label_values(&[reason]).get()
+    }
+
     /// Counts what was refused.
     pub fn refused(&self, reason: Refusal) {
         self.refused.with_label_values(&[reason.as_str()]).inc();

@@ -113,9 +113,13 @@ mod tests {
 
     #[test]
     fn three_digits_are_kept() {
-        for (value, text) in
-            [(0.0, "0"), (0.123_456, "0.123"), (52_148.0, "52100"), (9.999, "10.0"), (-1.234, "-1.23")]
-        {
+        for (value, text) in [
+            (0.0, "0"),
+            (0.123_456, "0.123"),
+            (52_148.0, "52100"),
+            (9.999, "10.0"),
+            (-1.234, "-1.23"),
+        ] {
             assert_eq!(rounded(value).unwrap().to_string(), text);
         }
         assert_eq!(rounded(f64::NAN), None);

@@ -19,8 +19,7 @@ use tokio::time::Instant;
 use super::limits::{MAX_PATH_BYTES, QUERIES, QUERY_TIME, SHARED_FOR};
 
 /// Paths of a monitor.
-const OF_MONITOR: &[&str] =
-    &["/v1/node", "/v1/ping", "/v1/latency", "/v1/health", "/v1/series"];
+const OF_MONITOR: &[&str] = &["/v1/node", "/v1/ping", "/v1/latency", "/v1/health", "/v1/series"];
 /// Paths of a worker.
 const OF_WORKER: &[&str] = &["/v1/status"];
 /// Paths of a flow.

@@ -102,7 +102,12 @@ mod tests {
     #[test]
     fn answers_of_several_flows_become_one_list() {
         let mut topics = Topics::new();
-        merge(&mut topics, &answer(&[("imu/data", "edge", "cloud"), ("map", "fog", "fog")]), "", None);
+        merge(
+            &mut topics,
+            &answer(&[("imu/data", "edge", "cloud"), ("map", "fog", "fog")]),
+            "",
+            None,
+        );
         merge(&mut topics, &answer(&[("imu/data", "edge", "fog")]), "", None);
         merge(&mut topics, "no JSON", "", None);
         let imu = item("imu/data", &topics["imu/data"]);
@@ -111,7 +116,12 @@ mod tests {
         assert_eq!(topics.len(), 2);
 
         let mut some = Topics::new();
-        merge(&mut some, &answer(&[("imu/data", "edge", "cloud"), ("map", "fog", "fog")]), "im", None);
+        merge(
+            &mut some,
+            &answer(&[("imu/data", "edge", "cloud"), ("map", "fog", "fog")]),
+            "im",
+            None,
+        );
         assert_eq!(some.keys().collect::<Vec<_>>(), ["imu/data"]);
     }
 

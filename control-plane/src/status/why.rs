@@ -254,33 +254,53 @@ mod tests {
 
     #[test]
     fn what_a_flow_says_of_itself_counts() {
-        let mut publisher = answer("edge/robot-1", "flowing", "ok", vec![
-            step("edge/robot-1", "advertise", true, "ok", "imu-driver, 50 Hz"),
-            step("cloud/cloud-1", "request", true, "ok", "as announced"),
-            step("edge/robot-1", "admit", true, "ok", ""),
-            step("cloud/cloud-1", "deliver", true, "ok", "as announced"),
-        ]);
+        let mut publisher = answer(
+            "edge/robot-1",
+            "flowing",
+            "ok",
+            vec![
+                step("edge/robot-1", "advertise", true, "ok", "imu-driver, 50 Hz"),
+                step("cloud/cloud-1", "request", true, "ok", "as announced"),
+                step("edge/robot-1", "admit", true, "ok", ""),
+                step("cloud/cloud-1", "deliver", true, "ok", "as announced"),
+            ],
+        );
         publisher.bridges = Some((bridges(100, 5), bridges(200, 10), Duration::from_secs(2)));
-        let consumer = answer("cloud/cloud-1", "not_flowing", "broker_down", vec![
-            step("cloud/cloud-1", "deliver", false, "broker_down", "redis does not answer"),
-            step("edge/robot-1", "advertise", true, "ok", "from afar"),
-        ]);
+        let consumer = answer(
+            "cloud/cloud-1",
+            "not_flowing",
+            "broker_down",
+            vec![
+                step("cloud/cloud-1", "deliver", false, "broker_down", "redis does not answer"),
+                step("edge/robot-1", "advertise", true, "ok", "from afar"),
+            ],
+        );
         let merged = merge(&ASKED, &[publisher, consumer]).unwrap();
         assert_eq!(merged["verdict"], "not_flowing");
-        assert_eq!((&merged["code"], &merged["remedy"]), (
-            &json!("broker_down"),
-            &json!("remedy of broker_down")
-        ));
+        assert_eq!(
+            (&merged["code"], &merged["remedy"]),
+            (&json!("broker_down"), &json!("remedy of broker_down"))
+        );
         let hops = merged["hops"].as_array().unwrap();
-        let shown: Vec<_> = hops.iter().map(|hop| (
-            hop["where"].as_str().unwrap(), hop["kind"].as_str().unwrap(), hop["ok"].as_bool().unwrap()
-        )).collect();
-        assert_eq!(shown, [
-            ("edge/robot-1", "service", true),
-            ("edge/robot-1", "flow", true),
-            ("cloud/cloud-1", "broker", false),
-            ("cloud/cloud-1", "service", true),
-        ]);
+        let shown: Vec<_> = hops
+            .iter()
+            .map(|hop| {
+                (
+                    hop["where"].as_str().unwrap(),
+                    hop["kind"].as_str().unwrap(),
+                    hop["ok"].as_bool().unwrap(),
+                )
+            })
+            .collect();
+        assert_eq!(
+            shown,
+            [
+                ("edge/robot-1", "service", true),
+                ("edge/robot-1", "flow", true),
+                ("cloud/cloud-1", "broker", false),
+                ("cloud/cloud-1", "service", true),
+            ]
+        );
         assert_eq!(hops[0]["detail"], "imu-driver, 50 Hz");
         assert_eq!(hops[2]["detail"], "redis does not answer");
         assert_eq!((&hops[1]["in_hz"], &hops[1]["out_hz"]), (&json!(52.5), &json!(50.0)));
@@ -291,10 +311,15 @@ mod tests {
     fn a_bound_token_sees_no_details_of_other_layers() {
         let edge = "edge".parse().unwrap();
         let asked = Asked { bound: Some(&edge), ..ASKED };
-        let answer = answer("edge/robot-1", "not_flowing", "no_request", vec![
-            step("edge/robot-1", "advertise", true, "ok", "imu-driver"),
-            step("cloud/cloud-1", "request", false, "no_request", "names of cloud"),
-        ]);
+        let answer = answer(
+            "edge/robot-1",
+            "not_flowing",
+            "no_request",
+            vec![
+                step("edge/robot-1", "advertise", true, "ok", "imu-driver"),
+                step("cloud/cloud-1", "request", false, "no_request", "names of cloud"),
+            ],
+        );
         let merged = merge(&asked, &[answer]).unwrap();
         assert_eq!(merged["hops"][0]["detail"], "imu-driver");
         assert!(!Value::Object(merged).to_string().contains("names of cloud"));

@@ -90,15 +90,14 @@ impl status_service_server::StatusService for Service {
     ) -> Result<Response<Responses>, Status> {
         let (call, mut requests) = Call::open(request)?;
         let slot = self.limits.open_watch(&call.caller.claims.subject);
-        let slot =
-            slot.map_err(|problem| self.refuse(&call, Refusal::TooManyNodes, &problem))?;
+        let slot = slot.map_err(|problem| self.refuse(&call, Refusal::TooManyNodes, &problem))?;
         let hello = self.greet(&call, &mut requests).await?;
         if hello.protocol > PROTOCOL + 1 {
             self.core.status_metrics().refused(Refusal::BadHello);
             return Ok(Response::new(sent_away(hello.protocol)));
         }
-        let hello = read_hello(hello)
-            .map_err(|problem| self.refuse(&call, Refusal::BadHello, &problem))?;
+        let hello =
+            read_hello(hello).map_err(|problem| self.refuse(&call, Refusal::BadHello, &problem))?;
         let opened = self.core.report(&call.caller, &hello, now()).await;
         let (session, sent) =
             opened.map_err(|(reason, problem)| self.refuse(&call, reason, &problem))?;
@@ -281,7 +280,8 @@ mod tests {
         for good in ["", "10.0.1.7:9103", "[fd00::7]:9103", "robot-1.lab.example:9103"] {
             assert!(is_address(good), "{good}");
         }
-        for bad in ["robot-1", "robot-1:", "robot-1:0", "a b:1", "http://x:1/", ":9103", "x:99999"] {
+        for bad in ["robot-1", "robot-1:", "robot-1:0", "a b:1", "http://x:1/", ":9103", "x:99999"]
+        {
             assert!(!is_address(bad), "{bad}");
         }
     }

@@ -26,8 +26,7 @@ fn short(call: &Call, param: Param) -> Result<&str, Problem> {
     match call.query.text(param).unwrap_or_default() {
         text if text.len() <= MAX_TEXT => Ok(text),
         _ => {
-            let detail =
-                format!("query parameter {} has more than {MAX_TEXT} bytes", param.name());
+            let detail = format!("query parameter {} has more than {MAX_TEXT} bytes", param.name());
             Err(Problem::new(Code::InvalidRequest, detail))
         }
     }

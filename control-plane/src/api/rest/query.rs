@@ -3,8 +3,8 @@
 use std::fmt::Display;
 use std::str::FromStr;
 
-use blaze_domain::{NameError, TopicName};
 use blaze_domain::config::{Code, MAX_INTEGER, Problem, Timestamp};
+use blaze_domain::{NameError, TopicName};
 
 use crate::core::ReadOptions;
 

@@ -249,24 +249,13 @@ const LIVE: &[Param] = &[
     Param::MinRevision,
     Param::Consistency,
 ];
-const WHY: &[Param] = &[
-    Param::WhyTopic,
-    Param::WhyTo,
-    Param::WhyFrom,
-    Param::MinRevision,
-    Param::Consistency,
-];
+const WHY: &[Param] =
+    &[Param::WhyTopic, Param::WhyTo, Param::WhyFrom, Param::MinRevision, Param::Consistency];
 const PROBLEMS: &[Param] =
     &[Param::Layer, Param::HealthState, Param::MinRevision, Param::Consistency];
-const TOPICS: &[Param] = &[
-    Param::Prefix,
-    Param::Limit,
-    Param::PageToken,
-    Param::MinRevision,
-    Param::Consistency,
-];
-const SERIES: &[Param] =
-    &[Param::SeriesNode, Param::Names, Param::MinRevision, Param::Consistency];
+const TOPICS: &[Param] =
+    &[Param::Prefix, Param::Limit, Param::PageToken, Param::MinRevision, Param::Consistency];
+const SERIES: &[Param] = &[Param::SeriesNode, Param::Names, Param::MinRevision, Param::Consistency];
 const DIGEST: &[Param] = &[Param::DigestLayer, Param::MinRevision, Param::Consistency];
 const AUDIT: &[Param] = &[
     Param::Subject,

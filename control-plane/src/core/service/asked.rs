@@ -117,8 +117,7 @@ impl ConfigService {
             answers.push(FlowAnswer { flow: flow.clone(), why: why.json.to_string(), bridges });
         }
         let to = query.to.as_ref().map(|to| to.text.as_str());
-        let question =
-            Asked { topic: query.topic.as_str(), to, bound: filter.bound.as_ref() };
+        let question = Asked { topic: query.topic.as_str(), to, bound: filter.bound.as_ref() };
         let Some(mut merged) = why::merge(&question, &answers) else {
             return Err(unreachable(&asked));
         };

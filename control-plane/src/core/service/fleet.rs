@@ -114,8 +114,7 @@ impl ConfigService {
         self.authorize(&caller.claims, Right::Read)?;
         let state = self.read_state(read).await?;
         self.inner.status.configure(&state);
-        let filter =
-            Filter { bound: view(&caller.claims).layer().cloned(), ..Filter::default() };
+        let filter = Filter { bound: view(&caller.claims).layer().cloned(), ..Filter::default() };
         Ok((state, filter))
     }
 

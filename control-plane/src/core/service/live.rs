@@ -173,9 +173,9 @@ impl ConfigService {
             (&flow, "/v1/peers"),
             (&flow, "/v1/allocation"),
         ];
-        let questions = parts.iter().filter_map(|(target, path)| {
-            Some((node.clone(), Question::new(target, path, &[])?))
-        });
+        let questions = parts
+            .iter()
+            .filter_map(|(target, path)| Some((node.clone(), Question::new(target, path, &[])?)));
         self.parts(questions).await
     }
 

@@ -167,12 +167,7 @@ fn topology_json(state: &State, view: &View, fleet: &Fleet, status: &Reported) -
     json!({ "revision": state.revision(), "layers": layers, "links": links })
 }
 
-fn node_json(
-    state: &State,
-    view: &View,
-    (fleet, status): (&Fleet, &Reported),
-    key: &Key,
-) -> Value {
+fn node_json(state: &State, view: &View, (fleet, status): (&Fleet, &Reported), key: &Key) -> Value {
     let node = NodeName::from(key.name());
     let kind = state.get(key).and_then(|held| held.document.spec_member("type").cloned());
     let seen = |key: &&Key| {
