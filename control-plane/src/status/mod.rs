@@ -40,6 +40,8 @@ pub enum Refusal {
     OlderEpoch,
     /// There are too many nodes.
     TooManyNodes,
+    /// Too many streams of the subject have not said Hello yet.
+    TooManyStreams,
     /// A message is too large.
     MessageTooLarge,
     /// A summary is too large.
@@ -58,6 +60,7 @@ impl Refusal {
         Self::BadHello,
         Self::OlderEpoch,
         Self::TooManyNodes,
+        Self::TooManyStreams,
         Self::MessageTooLarge,
         Self::SummaryTooLarge,
         Self::BadSummary,
@@ -73,6 +76,7 @@ impl Refusal {
             Self::BadHello => "bad_hello",
             Self::OlderEpoch => "older_epoch",
             Self::TooManyNodes => "too_many_nodes",
+            Self::TooManyStreams => "too_many_streams",
             Self::MessageTooLarge => "message_too_large",
             Self::SummaryTooLarge => "summary_too_large",
             Self::BadSummary => "bad_summary",

@@ -22,7 +22,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::gate::{self, Call};
 use super::status;
-use crate::api::limits::{ApiLimits, WatchSlot};
+use crate::api::limits::ApiLimits;
 use crate::core::ConfigService;
 use crate::status::limits::{AGAIN_MS, GREETING, MAX_WORD_BYTES};
 use crate::status::{MonitorHello, Refusal, Session, StatusMetrics, ToMonitor, now};
@@ -89,8 +89,10 @@ impl status_service_server::StatusService for Service {
         request: Request<Streaming<v1::ReportRequest>>,
     ) -> Result<Response<Responses>, Status> {
         let (call, mut requests) = Call::open(request)?;
-        let slot = self.limits.open_watch(&call.caller.claims.subject);
-        let slot = slot.map_err(|problem| self.refuse(&call, Refusal::TooManyNodes, &problem))?;
+        // Until it has said which node it is of: then there is one stream a node.
+        let greeting = self.limits.open_watch(&call.caller.claims.subject);
+        let greeting =
+            greeting.map_err(|problem| self.refuse(&call, Refusal::TooManyStreams, &problem))?;
         let hello = self.greet(&call, &mut requests).await?;
         if hello.protocol > PROTOCOL + 1 {
             self.core.status_metrics().refused(Refusal::BadHello);
@@ -101,12 +103,13 @@ impl status_service_server::StatusService for Service {
         let opened = self.core.report(&call.caller, &hello, now()).await;
         let (session, sent) =
             opened.map_err(|(reason, problem)| self.refuse(&call, reason, &problem))?;
+        drop(greeting);
         tracing::info!(
             layer = %hello.layer, node = %hello.node, version = hello.version, epoch = hello.epoch,
             "a monitor has come"
         );
         let sent = ReceiverStream::new(sent).boxed();
-        Ok(Response::new(responses(&self.core, call, session, requests, sent, slot)))
+        Ok(Response::new(responses(&self.core, call, session, requests, sent)))
     }
 }
 
@@ -127,7 +130,6 @@ fn responses(
     session: Session,
     requests: Streaming<v1::ReportRequest>,
     sent: stream::BoxStream<'static, ToMonitor>,
-    slot: WatchSlot,
 ) -> Responses {
     let metrics = core.status_metrics().clone();
     let taken = requests
@@ -141,7 +143,7 @@ fn responses(
         ending(problem.as_ref(), &request_id)
     });
     let events = stream::select(stream::select(taken, sent), end);
-    let responses = events.scan((slot, false), |(_, is_over), event| {
+    let responses = events.scan(false, |is_over, event| {
         if *is_over {
             return ready(None);
         }
