@@ -10,13 +10,15 @@ use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_domain::config::Kind;
 use blaze_domain::config::state::{Held, State};
-use blaze_domain::config::{Kind, Timestamp};
 use blaze_domain::{FlowId, LayerName, NodeName};
 
+use super::detail::HealthProblem;
 use super::health::{Damped, Health, Now, is_late};
+use super::layer::{LayerHealth, Nodes};
 use super::limits::MAX_NODES;
-use super::summary::{HealthProblem, Report, flow_hash};
+use super::summary::{Report, flow_hash};
 
 /// Whether a node that has reported still does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -159,63 +161,6 @@ fn rates(before: &Report, after: &Report) -> Rates {
     }
 }
 
-/// A layer.
-#[derive(Debug)]
-pub struct LayerHealth {
-    /// `edge`, `fog` or `cloud`.
-    pub kind: String,
-    health: Damped<Health>,
-    down: Vec<NodeName>,
-    down_since: Option<Timestamp>,
-    seen: usize,
-}
-
-impl LayerHealth {
-    fn new(kind: String, now: Now) -> Self {
-        let health = Damped::new(Health::Unknown, now);
-        Self { kind, health, down: Vec::new(), down_since: None, seen: 0 }
-    }
-
-    /// Its state.
-    #[must_use]
-    pub fn state(&self) -> Health {
-        self.health.value()
-    }
-
-    /// Since when.
-    #[must_use]
-    pub fn since(&self) -> Timestamp {
-        self.health.since()
-    }
-
-    /// What is wrong with the layer as a whole.
-    #[must_use]
-    pub fn problems(&self, layer: &LayerName) -> Vec<HealthProblem> {
-        let problem = |code: &str, state, since: Timestamp, detail, remedy: &str| HealthProblem {
-            state,
-            since: since.to_string(),
-            code: code.to_owned(),
-            scope: "layer".to_owned(),
-            name: layer.to_string(),
-            detail,
-            remedy: remedy.to_owned(),
-        };
-        let no_flow = (self.state() == Health::Down).then(|| {
-            let detail = format!("none of {} nodes that report has a ready flow", self.seen);
-            let remedy = "Look at the problems of its nodes, then at /readyz of a flow.";
-            problem("no_ready_flow", Health::Down, self.since(), detail, remedy)
-        });
-        let down = self.down_since.map(|since| {
-            let names: Vec<&str> = self.down.iter().take(5).map(NodeName::as_str).collect();
-            let more = if self.down.len() > names.len() { ", …" } else { "" };
-            let detail = format!("{} down: {}{more}", self.down.len(), names.join(", "));
-            let remedy = "Look at the problems of these nodes.";
-            problem("nodes_down", Health::Degraded, since, detail, remedy)
-        });
-        no_flow.into_iter().chain(down).collect()
-    }
-}
-
 /// A state that has changed, for the log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Change {
@@ -339,29 +284,23 @@ impl Fleet {
     /// Evaluates ages and layers.
     pub fn tick(&mut self, now: Now) -> Vec<Change> {
         let mut changes = self.tick_nodes(now);
-        for layer in self.layers.values_mut() {
-            layer.seen = 0;
-            layer.down.clear();
-        }
-        let mut sums: BTreeMap<LayerName, (usize, usize)> = BTreeMap::new();
-        for (node, entry) in &self.entries {
-            let Some(layer) = self.layers.get_mut(&entry.layer) else { continue };
-            // Of a monitor that has just come nothing is known yet.
-            if entry.report.is_none() {
-                continue;
+        let mut nodes: BTreeMap<LayerName, Nodes> = BTreeMap::new();
+        // Of a monitor that has just come nothing is known yet.
+        for (node, entry) in self.entries.iter().filter(|(_, entry)| entry.report.is_some()) {
+            if !nodes.contains_key(&entry.layer) {
+                nodes.insert(entry.layer.clone(), Nodes::default());
             }
-            layer.seen += 1;
-            let (ready, not_ok) = sums.entry(entry.layer.clone()).or_default();
-            *ready += entry.ready_flows();
+            let Some(of_layer) = nodes.get_mut(&entry.layer) else { continue };
             let health = entry.health();
-            *not_ok += usize::from(health != Health::Ok);
+            of_layer.seen += 1;
+            of_layer.ready_flows += entry.ready_flows();
+            of_layer.not_ok += usize::from(health != Health::Ok);
             if health == Health::Down {
-                layer.down.push(node.clone());
+                of_layer.down.push(node.clone());
             }
         }
         for (name, layer) in &mut self.layers {
-            let (ready, not_ok) = sums.get(name).copied().unwrap_or_default();
-            if layer.tick(ready, not_ok, now) {
+            if layer.tick(nodes.remove(name).unwrap_or_default(), now) {
                 changes.push(Change {
                     scope: "layer",
                     name: name.to_string(),
@@ -418,31 +357,6 @@ impl Fleet {
             (node.clone(), if gone { Presence::Gone } else { Presence::Silent })
         });
         presence.collect()
-    }
-}
-
-impl LayerHealth {
-    fn tick(&mut self, ready: usize, not_ok: usize, now: Now) -> bool {
-        match (self.down.is_empty(), self.down_since) {
-            (true, Some(_)) => self.down_since = None,
-            (false, None) => self.down_since = Some(now.time),
-            _ => {}
-        }
-        let seen = match (self.seen, ready, not_ok) {
-            (0, ..) => Health::Unknown,
-            (_, 0, _) => Health::Down,
-            (_, _, 0) => Health::Ok,
-            _ => Health::Degraded,
-        };
-        let before = self.state();
-        match (before, seen) {
-            // What is heard first is taken at once, unless others may still report a ready flow.
-            (Health::Unknown, Health::Ok | Health::Degraded) => self.health.set(seen, now),
-            (_, seen) => {
-                self.health.update(seen, now);
-            }
-        }
-        before != self.state()
     }
 }
 

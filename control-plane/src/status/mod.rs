@@ -11,9 +11,11 @@
 //! `Fleet`, `Questions` and what makes pictures of them have no clock and do no I/O. A summary that
 //! nobody looks at is kept as text, and a few values of it are read.
 
+pub mod detail;
 pub mod fleet;
 pub mod health;
 mod hub;
+pub mod layer;
 pub mod limits;
 mod metrics;
 pub mod patch;

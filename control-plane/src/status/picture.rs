@@ -8,11 +8,11 @@ use blaze_domain::config::{Document, Timestamp};
 use blaze_domain::{LayerName, NodeName};
 use serde_json::{Map, Value, json};
 
+use super::detail::{Detail, HealthProblem, Link, worst_first};
 use super::fleet::{Entry, Fleet, Presence};
 use super::health::{Health, Now};
 use super::limits::{IDLE_PERIOD, MAX_LISTED};
 use super::patch::{rounded, without_nulls};
-use super::summary::{Detail, HealthProblem, Link, worst_first};
 
 /// What is shown.
 #[derive(Debug, Clone, Default)]

@@ -120,8 +120,6 @@ enum Event {
     Taken,
     /// It ends, well or not.
     Over(Option<Status>),
-    /// It ends well, and the monitor is to come again.
-    Leave(ToMonitor),
 }
 
 fn responses(
@@ -140,9 +138,10 @@ fn responses(
     let request_id = call.caller.request_id;
     let end = stream::once(async move {
         let problem = core.stream_end(&claims).await;
-        ending(problem.as_ref(), &request_id)
-    });
-    let events = stream::select(stream::select(taken, sent), end);
+        stream::iter(ending(problem.as_ref(), &request_id))
+    })
+    .flatten();
+    let events = stream::select(stream::select(taken, sent), end.boxed());
     let responses = events.scan(false, |is_over, event| {
         if *is_over {
             return ready(None);
@@ -151,10 +150,6 @@ fn responses(
         ready(match event {
             Event::Taken => Some(None),
             Event::Send(message) => response(message),
-            Event::Leave(message) => {
-                *is_over = true;
-                response(message)
-            }
             Event::Over(status) => {
                 *is_over = true;
                 status.map(|status| Some(Err(status)))
@@ -164,17 +159,19 @@ fn responses(
     Box::pin(responses.filter_map(ready))
 }
 
-fn ending(problem: Option<&Problem>, request_id: &str) -> Event {
+/// Last word, and end.
+fn ending(problem: Option<&Problem>, request_id: &str) -> Vec<Event> {
     let leave = |reason: &str| {
-        Event::Leave(ToMonitor::GoAway {
+        let go_away = ToMonitor::GoAway {
             retry_after_ms: rand::rng().random_range(SOON_MS),
             reason: reason.to_owned(),
-        })
+        };
+        vec![Event::Send(go_away), Event::Over(None)]
     };
     match problem {
         None => leave("the stream has been open for long"),
         Some(problem) if problem.code == Code::ShuttingDown => leave("the service is ending"),
-        Some(problem) => Event::Over(Some(status::from_problem(problem, request_id))),
+        Some(problem) => vec![Event::Over(Some(status::from_problem(problem, request_id)))],
     }
 }
 
