@@ -4,7 +4,7 @@
 //! ```text
 //! listen ─▶ api: rest, grpc ─▶ core: rules, committer, watches ─▶ store: SQLite, MongoDB
 //!                │                    │
-//!                └── auth ────────────┴── secrets
+//!                └── auth ────────────┴── secrets, status (what monitors report)
 //! ```
 //!
 //! Interfaces translate and decide nothing; the core decides and does no I/O of its own; a store
@@ -23,5 +23,6 @@ pub mod process;
 mod reload;
 pub mod running;
 pub mod secrets;
+pub mod status;
 pub mod store;
 mod waiting;

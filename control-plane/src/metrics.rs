@@ -242,6 +242,17 @@ impl ApiMetrics {
         }
     }
 
+    /// Takes further numbers among its own.
+    ///
+    /// # Errors
+    /// If one of them is there already: a fault of this program.
+    pub fn add(
+        &self,
+        collectors: impl IntoIterator<Item = Box<dyn Collector>>,
+    ) -> prometheus::Result<()> {
+        collectors.into_iter().try_for_each(|collector| self.registry.register(collector))
+    }
+
     /// All numbers as text.
     #[must_use]
     pub fn text(&self) -> String {

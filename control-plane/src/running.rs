@@ -219,6 +219,7 @@ async fn build(
         readiness: readiness.clone(),
     };
     let service = ConfigService::start(supervisor, options).await?;
+    metrics.add(service.status_metrics().collectors()).context("metrics")?;
     let limits = Arc::new(ApiLimits::new(&section.limits));
     let rest = rest::router(
         service.clone(),

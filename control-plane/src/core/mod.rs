@@ -32,10 +32,12 @@ mod view;
 mod watch;
 mod workers;
 
+pub(crate) use committer::now;
 pub use committer::{CommitReport, OnCommit};
 pub use service::{
-    ConfigService, CoreOptions, DiffReport, OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL, SyncHello,
-    SyncItem, SyncStream,
+    ConfigService, CoreOptions, DiffReport, End, LiveItem, LiveQuery, LiveStream, LiveView,
+    OLDEST_SYNC_PROTOCOL, ProblemsQuery, SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream,
+    TopicsQuery, WhyQuery, live_view,
 };
 pub use types::*;
 pub use watch::WatchStream;

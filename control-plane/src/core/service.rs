@@ -1,7 +1,10 @@
 //! The use cases, as REST and gRPC call them. Every right is checked here, for every caller.
 
+mod asked;
 mod canaries;
+mod fleet;
 mod history;
+mod live;
 mod read;
 mod sync;
 mod tasks;
@@ -34,10 +37,14 @@ use super::watch::Watches;
 use super::workers::Workers;
 use crate::auth::{Authenticator, Claims, Revocations, Right, dev};
 use crate::secrets::Keyring;
+use crate::status::{Hub, StatusMetrics};
 use crate::store::{Store, StoreError};
 use blaze_domain::config::state::State;
 
+pub use asked::{End, TopicsQuery, WhyQuery};
+pub use fleet::ProblemsQuery;
 pub use history::DiffReport;
+pub use live::{LiveItem, LiveQuery, LiveStream, LiveView, live_view};
 pub use sync::{OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream};
 
 /// Refusals that wait to be written to the audit, at most.
@@ -101,6 +108,7 @@ struct Inner {
     denials: Mutex<token::DenialLimit>,
     workers: Arc<Workers>,
     digests: Digests,
+    status: Arc<Hub>,
     /// Snapshots that may still begin.
     snapshots: Arc<Semaphore>,
 }
@@ -135,6 +143,9 @@ impl ConfigService {
             on_commit: options.on_commit,
             doubtful: false,
         };
+        // Only a bad name could fail, and a test makes them.
+        let metrics =
+            StatusMetrics::new().map_err(|error| StoreError::Refused(error.to_string()))?;
         let watches = Arc::new(Watches {
             store: Arc::clone(&options.store),
             log: Arc::clone(&log),
@@ -163,6 +174,7 @@ impl ConfigService {
                 denials: Mutex::default(),
                 workers: Arc::default(),
                 digests: Digests::default(),
+                status: Arc::new(Hub::new(metrics)),
                 snapshots: Arc::new(Semaphore::new(sync::SNAPSHOTS)),
             }),
         };

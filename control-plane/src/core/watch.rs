@@ -23,7 +23,7 @@ use super::committer::{now, unavailable};
 use super::log::{Applied, Log};
 use super::types::{Caller, WatchCommit, WatchItem, WatchOp, WatchQuery};
 use super::view::{View, view};
-use crate::auth::Revocations;
+use crate::auth::{Claims, Revocations};
 use crate::store::{Change, Commit, Store};
 use blaze_domain::config::placement::Placement;
 use blaze_domain::config::state::{Effect, Held, State};
@@ -265,6 +265,54 @@ impl Watches {
     }
 }
 
+impl Watches {
+    /// Why every stream of this caller must end now.
+    pub(crate) fn trouble(&self, claims: &Claims) -> Option<Problem> {
+        if self.ending.is_cancelled() {
+            let detail =
+                "the service is ending; go on with the last id, at another process or soon";
+            return Some(Problem::new(Code::ShuttingDown, detail).retry_after(1));
+        }
+        let expired = claims.expires_s.is_some_and(|expires| now().as_millis() / 1000 >= expires);
+        let revoked = claims.token_id.as_ref().is_some_and(|id| self.revocations.is_revoked(id));
+        (expired || revoked).then(|| {
+            let detail = "the token ran out or was revoked; go on with the last id and a new token";
+            Problem::new(Code::Unauthenticated, detail)
+        })
+    }
+
+    /// Waits until a time, or until a stream of this caller must end before.
+    pub(crate) async fn ended(&self, claims: &Claims, until: Instant) -> Option<Problem> {
+        let mut revoked = self.revocations.changed();
+        let deadline = expiry(claims).map_or(until, |end| until.min(end));
+        loop {
+            if let Some(problem) = self.trouble(claims) {
+                return Some(problem);
+            }
+            if Instant::now() >= until {
+                return None;
+            }
+            tokio::select! {
+                // The sender lives in `self`.
+                _ = revoked.changed() => {}
+                () = self.ending.cancelled() => {}
+                () = tokio::time::sleep_until(deadline) => {}
+            }
+        }
+    }
+
+    /// When a stream that begins now ends by itself.
+    pub(crate) fn life_end() -> Instant {
+        Instant::now() + Duration::from_secs(rand::rng().random_range(LIFE))
+    }
+}
+
+/// When a token runs out.
+fn expiry(claims: &Claims) -> Option<Instant> {
+    let left = claims.expires_s?.saturating_mul(1000).saturating_sub(now().as_millis()).max(0) + 1;
+    Some(Instant::now() + Duration::from_millis(left.unsigned_abs()))
+}
+
 impl Watcher {
     async fn next(&mut self) -> Option<WatchItem> {
         match self.stage {
@@ -319,18 +367,8 @@ impl Watcher {
 
     /// Why the stream must end now.
     fn trouble(&self) -> Option<Problem> {
-        if self.shared.ending.is_cancelled() {
-            let detail =
-                "the service is ending; go on with the last id, at another process or soon";
-            return Some(Problem::new(Code::ShuttingDown, detail).retry_after(1));
-        }
-        let claims = &self.caller.claims;
-        let expired = claims.expires_s.is_some_and(|expires| now().as_millis() / 1000 >= expires);
-        let revoked =
-            claims.token_id.as_ref().is_some_and(|id| self.shared.revocations.is_revoked(id));
-        if expired || revoked {
-            let detail = "the token ran out or was revoked; go on with the last id and a new token";
-            return Some(Problem::new(Code::Unauthenticated, detail));
+        if let Some(problem) = self.shared.trouble(&self.caller.claims) {
+            return Some(problem);
         }
         if self.live
             && !self.patient
@@ -428,11 +466,7 @@ impl Watcher {
 
     async fn wait(&mut self) {
         let deadline = self.next_bookmark.min(self.end);
-        let expires = self.caller.claims.expires_s.map(|expires| {
-            let left = expires.saturating_mul(1000).saturating_sub(now().as_millis()).max(0);
-            Instant::now() + Duration::from_millis(left.unsigned_abs())
-        });
-        let deadline = expires.map_or(deadline, |expires| deadline.min(expires));
+        let deadline = expiry(&self.caller.claims).map_or(deadline, |end| deadline.min(end));
         tokio::select! {
             // The senders live in `shared`.
             _ = self.head.changed() => {}

@@ -208,6 +208,24 @@ impl Workers {
         workers.map(|(name, worker)| (name.clone(), worker.clone())).collect()
     }
 
+    /// Of each node the worker that is connected, else the one that was seen last: layer, revision,
+    /// digest, whether it is connected.
+    pub(crate) fn of_nodes<T>(
+        &self,
+        mut read: impl FnMut(&WorkerName, &Worker) -> T,
+    ) -> BTreeMap<NodeName, T> {
+        let known = self.known.lock();
+        let mut best: BTreeMap<&NodeName, (&WorkerName, &Worker)> = BTreeMap::new();
+        for (name, worker) in &known.workers {
+            let Some(node) = &name.node else { continue };
+            let weight = |worker: &Worker| (worker.is_connected(), worker.last_seen);
+            if best.get(node).is_none_or(|(_, held)| weight(held) <= weight(worker)) {
+                best.insert(node, (name, worker));
+            }
+        }
+        best.into_iter().map(|(node, (name, worker))| (node.clone(), read(name, worker))).collect()
+    }
+
     /// Other workers of the same layer and node that are connected: name and address, for people.
     pub(crate) fn beside(&self, worker: &WorkerName) -> Vec<String> {
         let first = WorkerName { id: String::new(), ..worker.clone() };

@@ -96,6 +96,7 @@ codes! {
     StoreUnavailable = "store_unavailable", 503, 14, "The store cannot be reached.";
     OutcomeUnknown = "outcome_unknown", 503, 2, "Whether the change took effect is not known.";
     Overloaded = "overloaded", 503, 14, "The service has too much to do.";
+    NodeUnreachable = "node_unreachable", 503, 14, "The monitor of a node does not answer.";
     ShuttingDown = "shutting_down", 503, 14, "The service is ending.";
     DeadlineExceeded = "deadline_exceeded", 504, 4, "It took too long.";
 }

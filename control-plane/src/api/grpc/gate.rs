@@ -109,9 +109,9 @@ impl Gate {
             Ok((method, time)) => {
                 let caller = Caller { claims, request_id: head.id.clone(), address: head.address };
                 let limits = &self.limits;
-                // The messages of a worker come as long as its stream is open: they are no upload
-                // on its way.
-                let request = match method == methods::SYNC {
+                // The messages of a worker or monitor come as long as its stream is open: they are
+                // no upload on its way.
+                let request = match [methods::SYNC, methods::REPORT].contains(&method) {
                     true => request,
                     false => request.map(|body| limits.metered(body)),
                 };

@@ -1,4 +1,4 @@
-//! The methods of `blaze.v1.ConfigService`: what right each needs. A method that is not in this
+//! The methods of `blaze.v1.ConfigService`, `SyncService` and `StatusService`: what right each needs. A method that is not in this
 //! table is not served.
 
 use crate::auth::Right;
@@ -8,6 +8,9 @@ pub(super) const PATH: &str = "/blaze.v1.ConfigService/";
 
 /// The one method of the workers, `blaze.v1.SyncService`.
 pub(super) const SYNC_PATH: &str = "/blaze.v1.SyncService/Sync";
+
+/// The one method of the monitors, `blaze.v1.StatusService`.
+pub(super) const REPORT_PATH: &str = "/blaze.v1.StatusService/Report";
 
 /// One method.
 #[derive(Debug, PartialEq, Eq)]
@@ -65,10 +68,17 @@ pub(super) const METHODS: &[Method] = &[
 pub(super) const SYNC: &Method =
     &Method { name: "Sync", right: Right::Sync, action: "sync", writes: false };
 
+/// What monitors call; the same kind of stream.
+pub(super) const REPORT: &Method =
+    &Method { name: "Report", right: Right::Sync, action: "report", writes: false };
+
 /// The method of a path.
 pub(super) fn of_path(path: &str) -> Option<&'static Method> {
     if path == SYNC_PATH {
         return Some(SYNC);
+    }
+    if path == REPORT_PATH {
+        return Some(REPORT);
     }
     let name = path.strip_prefix(PATH)?;
     METHODS.iter().find(|method| method.name == name)
@@ -95,6 +105,7 @@ mod tests {
     fn only_exact_paths_are_methods() {
         assert_eq!(of_path("/blaze.v1.ConfigService/Get").unwrap().name, "Get");
         assert_eq!(of_path(SYNC_PATH), Some(SYNC));
+        assert_eq!(of_path(REPORT_PATH), Some(REPORT));
         for path in [
             "/blaze.v1.ConfigService/get",
             "/blaze.v1.ConfigService/Get/",

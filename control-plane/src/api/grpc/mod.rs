@@ -1,9 +1,11 @@
-//! gRPC: `blaze.v1.ConfigService` and `blaze.v1.SyncService` on the core, health, reflection.
+//! gRPC: `blaze.v1.ConfigService`, `blaze.v1.SyncService` and `blaze.v1.StatusService` on the core,
+//! health, reflection.
 //!
 //! ```text
 //! axum::Router ─┬─ blaze.v1.ConfigService ─ gate ─▶ service ─▶ operations ─▶ core::ConfigService
 //!               │                                     └─ incoming, outgoing, watch, status
 //!               ├─ blaze.v1.SyncService ─── gate ─▶ sync ─────────────────▶ core::ConfigService
+//!               ├─ blaze.v1.StatusService ─ gate ─▶ monitors ─────────────▶ core::ConfigService
 //!               ├─ grpc.health.v1.Health            without a token, follows readiness
 //!               └─ grpc.reflection.v1, v1alpha      without a token, only if it is switched on
 //! ```
@@ -15,6 +17,7 @@ mod gate;
 mod health;
 mod incoming;
 mod methods;
+mod monitors;
 mod operations;
 mod outgoing;
 mod service;
@@ -29,9 +32,11 @@ use std::sync::Arc;
 use axum::{Router, middleware};
 use blaze_proto::CONFIG_DESCRIPTORS;
 use blaze_proto::v1::config_service_server::ConfigServiceServer;
+use blaze_proto::v1::status_service_server::StatusServiceServer;
 use blaze_proto::v1::sync_service_server::SyncServiceServer;
 use blaze_runtime::Readiness;
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 use tonic::service::Routes;
 use tonic_health::pb::health_server::HealthServer;
 use tonic_reflection::server::Builder as Reflection;
@@ -39,6 +44,7 @@ use tonic_reflection::server::Builder as Reflection;
 use super::limits::ApiLimits;
 use crate::core::ConfigService;
 use crate::metrics::ApiMetrics;
+use crate::status::limits::MAX_MESSAGE_BYTES as MAX_REPORT_BYTES;
 
 /// Largest message, in bytes, in and out (16 MiB).
 pub const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
@@ -79,11 +85,16 @@ pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
         Arc::clone(&options.metrics),
     );
     let workers = SyncServiceServer::new(workers).max_decoding_message_size(MAX_MESSAGE_BYTES);
+    let monitors = monitors::Service::new(service.clone(), Arc::clone(&options.limits));
+    let monitors = StatusServiceServer::new(monitors)
+        .max_decoding_message_size(MAX_REPORT_BYTES)
+        .accept_compressed(CompressionEncoding::Gzip);
     let config =
         ConfigServiceServer::new(service::Service::new(service, options.limits, options.metrics))
             .max_decoding_message_size(MAX_MESSAGE_BYTES);
     let config = Routes::new(config)
         .add_service(workers)
+        .add_service(monitors)
         .into_axum_router()
         .reset_fallback()
         .route_layer(middleware::from_fn_with_state(Arc::clone(&gate), gate::gate));

@@ -3,6 +3,7 @@
 mod answers;
 mod bound;
 mod fixture;
+mod monitors;
 
 use std::time::Duration;
 

@@ -5,7 +5,8 @@
 //!              └▶ gate      431, 414, Host, --dev's 403 ┬─ outside /api/ ─▶ pages       livez … docs, else 404
 //!                           429, 401, limits      └─ routes ─▶ 404, 405, else
 //!                   └▶ operation  name 404, 406, 403, body 413/415, 400, a place among those at work
-//!                          └▶ documents, history, apply, effective, system, tokens, watch ─▶ core
+//!                          └▶ documents, history, apply, effective, system, tokens, watch, live,
+//!                                 monitoring ─▶ core
 //! ```
 //!
 //! The checks come in this order for every request; what a document may be is the core's matter.
@@ -19,7 +20,9 @@ mod frame;
 mod gate;
 mod headers;
 mod history;
+mod live;
 mod many;
+mod monitoring;
 mod negotiate;
 mod openapi;
 mod operation;

@@ -13,7 +13,7 @@ pub(super) const EVENT_STREAM: &str = "text/event-stream";
 /// Types that a route gives; any of them is enough.
 fn offered(action: Action) -> [&'static str; 2] {
     match action {
-        Action::Watch => [EVENT_STREAM, PROBLEM],
+        Action::Watch | Action::Live => [EVENT_STREAM, PROBLEM],
         _ => [JSON, PROBLEM],
     }
 }

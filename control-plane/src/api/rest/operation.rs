@@ -20,8 +20,8 @@ use super::gate::{Known, unknown};
 use super::query::Query;
 use super::routes::{Action, Route, Verb};
 use super::{
-    Rest, documents, effective, headers, history, many, negotiate, reply, requests, system, tokens,
-    watch,
+    Rest, documents, effective, headers, history, live, many, monitoring, negotiate, reply,
+    requests, system, tokens, watch,
 };
 use crate::auth::Right;
 use crate::core::{Caller, ConfigService, Idempotency, ReadOptions};
@@ -246,6 +246,12 @@ async fn perform(call: &Call, action: Action) -> Result<Response, Problem> {
         Action::Effective => effective::get(call).await,
         Action::Watch => watch::open(call).await,
         Action::Topology => system::topology(call).await,
+        Action::Live => live::open(call).await,
+        Action::Why => monitoring::why(call).await,
+        Action::Problems => monitoring::problems(call).await,
+        Action::Topics => monitoring::topics(call).await,
+        Action::Series => monitoring::series(call).await,
+        Action::Targets => monitoring::targets(call).await,
         Action::Workers => system::workers(call).await,
         Action::Digest => system::digest(call).await,
         Action::Audit => system::audit(call).await,

@@ -3,8 +3,8 @@
 use std::fmt::Display;
 use std::str::FromStr;
 
-use blaze_domain::NameError;
 use blaze_domain::config::{Code, MAX_INTEGER, Problem, Timestamp};
+use blaze_domain::{NameError, TopicName};
 
 use crate::core::ReadOptions;
 
@@ -63,6 +63,17 @@ params! {
     Name = "name", "Only documents of this name.";
     TimeoutS = "timeout_s", "Ends the stream cleanly after so many seconds.";
     DigestLayer = "layer", "Layer whose view is digested.";
+    LiveView = "view", "What is looked at; default: fleet. `node` needs `node`, `topic` needs `topic`.";
+    LiveNode = "node", "Only this node.";
+    LiveTopic = "topic", "Name of a topic.";
+    PeriodMs = "period_ms", "Milliseconds between two deltas, at least.";
+    WhyTopic = "topic", "Name of a topic.";
+    WhyTo = "to", "Whom it should reach: layer, layer/node or layer/node/service.";
+    WhyFrom = "from", "Whose publisher: layer, layer/node or layer/node/service.";
+    HealthState = "state", "Only problems of this state.";
+    Prefix = "prefix", "Only topics whose name begins so.";
+    SeriesNode = "node", "The node whose monitor is asked.";
+    Names = "names", "Names of metrics, joined by commas; default: all.";
     Subject = "subject", "Only entries of this subject.";
     AuditName = "name", "Only entries of documents of this name.";
     Action = "action", "Only entries of this action.";
@@ -114,6 +125,26 @@ impl Query {
         param: Param,
     ) -> Result<Option<T>, Problem> {
         let read = |text: &str| text.parse().map_err(|error: NameError| invalid(param, &error));
+        self.text(param).map(read).transpose()
+    }
+
+    /// The name of a topic.
+    ///
+    /// # Errors
+    /// `invalid_request`.
+    pub(super) fn topic(&self, param: Param) -> Result<Option<TopicName>, Problem> {
+        self.parsed(param)
+    }
+
+    /// Anything that is read from a text.
+    ///
+    /// # Errors
+    /// `invalid_request`.
+    pub(super) fn parsed<T: FromStr<Err: Display>>(
+        &self,
+        param: Param,
+    ) -> Result<Option<T>, Problem> {
+        let read = |text: &str| text.parse().map_err(|error| invalid(param, &error));
         self.text(param).map(read).transpose()
     }
 

@@ -76,6 +76,12 @@ pub(super) enum Action {
     Effective,
     Watch,
     Topology,
+    Live,
+    Why,
+    Problems,
+    Topics,
+    Series,
+    Targets,
     Workers,
     Digest,
     Audit,
@@ -105,6 +111,12 @@ impl Action {
             Self::Effective => "effective",
             Self::Watch => "watch",
             Self::Topology => "topology",
+            Self::Live => "live",
+            Self::Why => "why",
+            Self::Problems => "problems",
+            Self::Topics => "topics",
+            Self::Series => "series",
+            Self::Targets => "targets",
             Self::Workers => "workers",
             Self::Digest => "digest",
             Self::Audit => "audit",
@@ -133,6 +145,12 @@ impl Action {
             | Self::Effective
             | Self::Watch
             | Self::Topology
+            | Self::Live
+            | Self::Why
+            | Self::Problems
+            | Self::Topics
+            | Self::Series
+            | Self::Targets
             | Self::Workers
             | Self::Digest
             | Self::Audit
@@ -220,6 +238,24 @@ const WATCH: &[Param] = &[
     Param::Consistency,
 ];
 const READ: &[Param] = &[Param::MinRevision, Param::Consistency];
+const LIVE: &[Param] = &[
+    Param::LiveView,
+    Param::LiveNode,
+    Param::LiveTopic,
+    Param::Layer,
+    Param::LabelSelector,
+    Param::PeriodMs,
+    Param::TimeoutS,
+    Param::MinRevision,
+    Param::Consistency,
+];
+const WHY: &[Param] =
+    &[Param::WhyTopic, Param::WhyTo, Param::WhyFrom, Param::MinRevision, Param::Consistency];
+const PROBLEMS: &[Param] =
+    &[Param::Layer, Param::HealthState, Param::MinRevision, Param::Consistency];
+const TOPICS: &[Param] =
+    &[Param::Prefix, Param::Limit, Param::PageToken, Param::MinRevision, Param::Consistency];
+const SERIES: &[Param] = &[Param::SeriesNode, Param::Names, Param::MinRevision, Param::Consistency];
 const DIGEST: &[Param] = &[Param::DigestLayer, Param::MinRevision, Param::Consistency];
 const AUDIT: &[Param] = &[
     Param::Subject,
@@ -299,7 +335,7 @@ static INSTANCES: [Route; 9] =
     collection!(Instance, "instance", "instances", "/api/v1/services/{service}/instances");
 static ROLLOUTS: [Route; 9] = collection!(Rollout, "rollout", "rollouts", "/api/v1/rollouts");
 
-static OTHERS: [Route; 14] = [
+static OTHERS: [Route; 20] = [
     row!(
         Post "/api/v1/rollouts/{name}/promote",
         "promote_rollout",
@@ -331,6 +367,44 @@ static OTHERS: [Route; 14] = [
         Get "/api/v1/topology",
         "get_topology",
         Action::Topology,
+        Read,
+        READ,
+        Payload::None,
+        &[200, 410],
+    ),
+    row!(Get "/api/v1/live", "live", Action::Live, Read, LIVE, Payload::None, &[200, 404, 410]),
+    row!(Get "/api/v1/why", "why", Action::Why, Read, WHY, Payload::None, &[200, 404, 410]),
+    row!(
+        Get "/api/v1/problems",
+        "list_problems",
+        Action::Problems,
+        Read,
+        PROBLEMS,
+        Payload::None,
+        &[200, 410],
+    ),
+    row!(
+        Get "/api/v1/topics",
+        "list_topics",
+        Action::Topics,
+        Read,
+        TOPICS,
+        Payload::None,
+        &[200, 410],
+    ),
+    row!(
+        Get "/api/v1/series",
+        "get_series",
+        Action::Series,
+        Read,
+        SERIES,
+        Payload::None,
+        &[200, 404, 410],
+    ),
+    row!(
+        Get "/api/v1/targets",
+        "list_targets",
+        Action::Targets,
         Read,
         READ,
         Payload::None,
@@ -440,7 +514,7 @@ mod tests {
         pairs.sort_unstable();
         pairs.dedup();
         assert_eq!(pairs.len(), count);
-        assert_eq!(count, 59);
+        assert_eq!(count, 65);
     }
 
     #[test]

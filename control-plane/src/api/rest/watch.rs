@@ -50,17 +50,27 @@ pub(super) async fn open(call: &Call) -> Result<Response, Problem> {
     let events = Events {
         items: answer.value,
         visit: call.visit.clone(),
-        ready: VecDeque::from([Bytes::from(format!("retry: {}\n", rand::random_range(RETRY_MS)))]),
+        ready: VecDeque::from([retry_line()]),
         ended: false,
         _slot: slot,
         _open: call.rest().options.metrics.watcher(),
     };
-    let mut response = Response::new(Body::from_stream(events.into_stream()));
+    Ok(streaming(Body::from_stream(events.into_stream()), answer.revision))
+}
+
+/// The answer that events go on in.
+pub(super) fn streaming(events: Body, revision: u64) -> Response {
+    let mut response = Response::new(events);
     *response.status_mut() = StatusCode::OK;
     reply::set(&mut response, CONTENT_TYPE, EVENT_STREAM);
     reply::set(&mut response, X_ACCEL_BUFFERING, "no");
-    reply::set(&mut response, super::headers::BLAZE_REVISION, &answer.revision.to_string());
-    Ok(response)
+    reply::set(&mut response, super::headers::BLAZE_REVISION, &revision.to_string());
+    response
+}
+
+/// The first line of a stream.
+pub(super) fn retry_line() -> Bytes {
+    Bytes::from(format!("retry: {}\n", rand::random_range(RETRY_MS)))
 }
 
 fn query(call: &Call) -> Result<WatchQuery, Problem> {

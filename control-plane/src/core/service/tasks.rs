@@ -82,6 +82,7 @@ impl ConfigService {
         spawn("trimming", Box::pin(self.clone().trim_periodically(parts.history)));
         spawn("tidying", Box::pin(self.clone().tidy_periodically()));
         spawn("tokens", Box::pin(self.clone().refresh_periodically()));
+        spawn("health of nodes", Box::pin(self.clone().evaluate_health()));
         spawn("store health", Box::pin(self.clone().watch_health(parts.readiness)));
         spawn("audit of refusals", Box::pin(self.clone().write_denials(parts.denials)));
         if self.inner.store.is_shared() {

@@ -12,6 +12,8 @@ use super::super::workers::{Running, RunningState, Worker, WorkerName};
 use super::read::answer;
 use super::{ConfigService, not_found};
 use crate::auth::Right;
+use crate::status::fleet::Fleet as Reported;
+use crate::status::picture::{self, Filter};
 use blaze_domain::config::state::State;
 
 impl ConfigService {
@@ -28,21 +30,8 @@ impl ConfigService {
         let state = self.read_state(read).await?;
         let view = view(&caller.claims);
         let fleet = self.fleet(&state, &view);
-        let layers = state
-            .of_kind(Kind::Layer, None)
-            .filter(|(_, held)| view.sees_document(&state, &held.document))
-            .map(|(key, held)| {
-                let layer = LayerName::from(key.name());
-                let nodes = state.in_layer(&layer).filter(|key| key.kind() == Kind::Node);
-                json!({
-                    "name": layer.as_str(),
-                    "kind": held.document.spec_member("kind"),
-                    "nodes": nodes.map(|key| node_json(&state, &view, &fleet,
-                        key)).collect::<Vec<_>>(),
-                })
-            });
-        let layers: Vec<Value> = layers.collect();
-        let value = json!({ "revision": state.revision(), "layers": layers, "links": [] });
+        self.status().configure(&state);
+        let value = self.status().read(|status| topology_json(&state, &view, &fleet, status));
         Ok(answer(&state, value))
     }
 
@@ -157,7 +146,28 @@ fn worker_json(fleet: &Fleet, node: &NodeName) -> Value {
     }
 }
 
-fn node_json(state: &State, view: &View, fleet: &Fleet, key: &Key) -> Value {
+fn topology_json(state: &State, view: &View, fleet: &Fleet, status: &Reported) -> Value {
+    let layers = state
+        .of_kind(Kind::Layer, None)
+        .filter(|(_, held)| view.sees_document(state, &held.document))
+        .map(|(key, held)| {
+            let layer = LayerName::from(key.name());
+            let nodes = state.in_layer(&layer).filter(|key| key.kind() == Kind::Node);
+            let nodes = nodes.map(|key| node_json(state, view, (fleet, status), key));
+            json!({
+                "name": layer.as_str(),
+                "kind": held.document.spec_member("kind"),
+                "health": picture::layer_health(status, &layer),
+                "nodes": nodes.collect::<Vec<_>>(),
+            })
+        });
+    let layers: Vec<Value> = layers.collect();
+    let filter = Filter { bound: view.layer().cloned(), ..Filter::default() };
+    let links = picture::topology_links(status, &filter);
+    json!({ "revision": state.revision(), "layers": layers, "links": links })
+}
+
+fn node_json(state: &State, view: &View, (fleet, status): (&Fleet, &Reported), key: &Key) -> Value {
     let node = NodeName::from(key.name());
     let kind = state.get(key).and_then(|held| held.document.spec_member("type").cloned());
     let seen = |key: &&Key| {
@@ -182,12 +192,14 @@ fn node_json(state: &State, view: &View, fleet: &Fleet, key: &Key) -> Value {
             "service": service.as_str(), "instance": instance.as_str(),
             "state": running.map(|running| running.state.as_str()),
             "config_revision": running.map(|running| running.config_revision),
+            "health": picture::service_health(status, &node, service.as_str(), instance.as_str()),
         })
     });
     json!({
         "name": node.as_str(),
         "type": kind.unwrap_or_else(|| "static".into()),
         "worker": worker_json(fleet, &node),
+        "health": picture::node_health(status, &node),
         "services": services.collect::<Vec<_>>(),
     })
 }

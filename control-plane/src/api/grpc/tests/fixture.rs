@@ -32,9 +32,10 @@ use crate::store::SqliteStore;
 pub(super) struct Fixture {
     pub(super) router: Router,
     /// The other interface of the same service.
-    rest: Router,
+    pub(super) rest: Router,
     pub(super) readiness: Readiness,
     pub(super) metrics: Arc<ApiMetrics>,
+    pub(super) core: ConfigService,
     keys: Authenticator,
     _supervisor: Supervisor,
 }
@@ -94,7 +95,8 @@ impl Fixture {
             stopping: supervisor.stopping_token(),
         };
         Self {
-            router: router(core, options),
+            router: router(core.clone(), options),
+            core,
             rest,
             readiness,
             metrics,

@@ -4,14 +4,18 @@ use std::path::PathBuf;
 use blaze_domain::LayerKind;
 use blaze_domain::config::selector::{MAX_LABEL_BYTES, MAX_SELECTOR_BYTES};
 use blaze_domain::config::{Kind, MAX_DOCUMENTS, MAX_INTEGER, MAX_LABELS, spec};
+use blaze_domain::names::MAX_TOPIC_BYTES;
 
 use super::super::history::VIEWS;
+use super::super::monitoring::MAX_TEXT;
 use super::super::query::{CONSISTENCY, Param};
 use super::super::requests::{MAX_LIFE_S, MAX_REASON};
 use super::super::system::{MAX_ACTION, MAX_SUBJECT, OUTCOMES};
 use super::super::watch::MAX_TIMEOUT_S;
 use super::*;
 use crate::auth::Role;
+use crate::status::health::Health;
+use crate::status::limits::{DEFAULT_PERIOD_MS, MAX_LISTED, PERIOD_MS};
 
 fn committed(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../openapi").join(name)
@@ -107,6 +111,15 @@ fn words_and_limits_are_those_of_the_code() {
         ("/query/Revision/maximum", json!(MAX_INTEGER)),
         ("/query/PruneConfirm/maximum", json!(MAX_DOCUMENTS)),
         ("/query/TimeoutS/maximum", json!(MAX_TIMEOUT_S)),
+        ("/query/LiveTopic/maxLength", json!(MAX_TOPIC_BYTES)),
+        ("/query/WhyTopic/maxLength", json!(MAX_TOPIC_BYTES)),
+        ("/query/LiveView/enum", json!(super::super::live::VIEWS)),
+        ("/query/HealthState/enum", json!(Health::WORDS)),
+        ("/query/PeriodMs/minimum", json!(PERIOD_MS.start())),
+        ("/query/PeriodMs/maximum", json!(PERIOD_MS.end())),
+        ("/query/PeriodMs/default", json!(DEFAULT_PERIOD_MS)),
+        ("/query/Names/maxLength", json!(MAX_TEXT)),
+        ("HealthProblemPage/properties/items/maxItems", json!(MAX_LISTED)),
         ("/query/Subject/maxLength", json!(MAX_SUBJECT)),
         ("/query/Action/maxLength", json!(MAX_ACTION)),
         ("ApplyItem/properties/kind/enum", json!(kinds)),
