@@ -12,8 +12,10 @@ use super::limits;
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Fault {
     /// The permissions of the file.
-    #[error("{} cannot be read: permission denied. Run the monitor as root, or allow it: chmod a+r {}",
-        .0.display(), .0.display())]
+    #[error(
+        "{} cannot be read: permission denied. Run the monitor as root, or: chmod a+r {}",
+        .0.display(), .0.display()
+    )]
     Denied(PathBuf),
     /// Another fault of the file.
     #[error("{} cannot be opened: {error}", path.display())]

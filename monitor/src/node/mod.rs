@@ -1,9 +1,9 @@
 //! Values of the node: what the kernel and the hardware say of it.
 //!
 //! ```text
-//! /proc, /sys, NVML, adjtimex ─► collectors, a thread each ─► Sampler::sample ─► Sample ─┬─► series    /metrics
-//!                                (file, procfs, sensors, …)    the newest of each        ├─► NodeStatus /v1/node
-//!                                                                                        └─► Vitals     health
+//! /proc, /sys, NVML, adjtimex ─► collectors, a thread each ─► Sampler::sample
+//!                                                                  │ the newest of each
+//!          series (/metrics), NodeStatus (/v1/node), Vitals (health) ◄─ Sample
 //! ```
 //!
 //! Each value is probed by itself and checked for sense. What the machine lacks has no series; a
@@ -16,8 +16,10 @@
 //!   further mounts of the same device;
 //! - disks: partitions, loop, RAM, zram, optical, device mapper and RAID devices;
 //! - interfaces: one end of a container's or a virtual machine's pair, bridges of container
-//!   engines, tunnels that the kernel makes by itself ([`procfs`]). `lo`, VLANs, bonds and VPNs stay;
-//! - sensors: hwmon copies of a thermal zone, zones with a constant, batteries of mice and keyboards.
+//!   engines, tunnels that the kernel makes by itself (`NO_INTERFACES` of `procfs`). `lo`, VLANs,
+//!   bonds and VPNs stay;
+//! - sensors: hwmon copies of a thermal zone, zones with a constant, batteries of mice and
+//!   keyboards.
 
 mod cgroup;
 mod clock;

@@ -1,7 +1,8 @@
 //! Collectors over tables of /proc: CPUs, pressure, memory, disk traffic, network, UDP, Wi-Fi.
 //!
-//! The parsers are those of `procfs-core`, with two exceptions: its parser of `net/snmp` demands the
-//! counters of UDP-Lite, which newer kernels lack, and it has none for `net/wireless`.
+//! The parsers are those of `procfs-core`, with two exceptions: its parser of `net/snmp` demands
+//! counters that not each kernel has (those of UDP-Lite among them), and it has none for
+//! `net/wireless`.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

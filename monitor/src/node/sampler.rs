@@ -67,9 +67,9 @@ struct Wanted {
 }
 
 impl Signal {
-    /// Waits until the values are wanted again; `false` at the end. A collector follows the samples,
-    /// so each has new values and their differences make rates; without samples, its own clock. The
-    /// time counts from the end of the last run: a slow driver is not asked without a pause.
+    /// Waits until the values are wanted again; `false` at the end. A collector follows the
+    /// samples, so each has new values and their differences make rates; without samples, its own
+    /// clock. The time counts from the end of the last run: a slow driver has a pause.
     fn wait(&self, ended: Instant, seen: &mut u64) -> bool {
         let mut state = self.state.lock();
         loop {

@@ -10,7 +10,7 @@ pub(super) const ALL_ASKED: usize = 64;
 pub(super) const PER_LAYER: usize = 8;
 /// Nodes asked in all layers together where not all are asked. Each asked node answers each that asks
 /// on one topic, so the pongs that a node receives grow with the square of this number.
-pub(super) const IN_ALL: usize = 20;
+pub(super) const IN_ALL: usize = 16;
 /// Nodes asked because their topics are measured: as many as `ALL_ASKED`, which bounds the series.
 pub(super) const MEASURED: usize = 64;
 /// Known nodes: ten times the largest system that was simulated.
@@ -39,7 +39,7 @@ pub(super) const ANSWER_INTERVAL: Duration = Duration::from_secs(1);
 pub(super) const ANSWERS_WAITING: usize = 512;
 /// Answers that wait for one node: one request for pings at the shortest interval, and its rounds.
 pub(super) const ANSWERS_PER_NODE: usize = 32;
-/// Pings that wait for answers: 20 layers, and a request at the shortest interval, for 5 s.
+/// Pings that wait for answers: 16 layers, and a request at the shortest interval, for 5 s.
 pub(super) const OPEN_PINGS: usize = 512;
 /// Samples of a node's clock that are kept; the one with the least error counts.
 pub(super) const CLOCK_SAMPLES: usize = 8;

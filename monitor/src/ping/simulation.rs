@@ -20,11 +20,10 @@ fn nodes(layer: &str, count: usize) -> Vec<FlowId> {
 
 /// A network whose clocks are wrong by up to 3 s.
 fn network(ids: Vec<FlowId>) -> Net {
-    let clocks = (0..ids.len() as i64).map(|n| {
-        let course = TestClock::default().course + (n * 37 % 61 - 30) * 100 * MS;
-        TestClock { course, ..TestClock::default() }
-    });
-    let clocks = clocks.collect();
+    let mut clocks = vec![TestClock::default(); ids.len()];
+    for (clock, n) in clocks.iter_mut().zip(0..) {
+        clock.course += (n * 37 % 61 - 30) * 100 * MS;
+    }
     Net::new(ids, clocks, SEED, delays())
 }
 
@@ -92,7 +91,7 @@ fn thousand_nodes(edge_layers: usize, seconds: i64) {
     net.run_until(S);
     let before: Vec<_> = (0..1_000).map(|n| series(&net, n)).collect();
     let most = before.iter().map(BTreeSet::len).max().unwrap();
-    assert!(most <= 20 && before.iter().all(|series| series.len() >= 10));
+    assert!(most <= 16 && before.iter().all(|series| series.len() >= 10));
     let layers: BTreeSet<_> = before[0].iter().map(|node| node.layer.clone()).collect();
     assert_eq!(layers.len(), edge_layers + 2);
     // The start of all at once is no flood either.
@@ -108,9 +107,9 @@ fn thousand_nodes(edge_layers: usize, seconds: i64) {
     assert!(rows.iter().all(|row| row.lost == 0 && row.clock_offset_ms.is_some()));
 }
 
-/// An hour with `BLAZE_LONG`, else two and a half periods of 100 s.
+/// An hour with `BLAZE_LONG`, else a period of 100 s with its jitter and more.
 fn seconds() -> i64 {
-    if std::env::var_os("BLAZE_LONG").is_some() { 3_600 } else { 230 }
+    if std::env::var_os("BLAZE_LONG").is_some() { 3_600 } else { 120 }
 }
 
 #[test]
