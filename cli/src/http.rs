@@ -109,9 +109,7 @@ where
         GetError::Unreachable(reason) => {
             CliError::CannotConnect { program, address: address.clone(), reason }
         }
-        GetError::Answer(reason) => {
-            CliError::Answer { program, address: address.clone(), reason }
-        }
+        GetError::Answer(reason) => CliError::Answer { program, address: address.clone(), reason },
     })?;
     match status {
         200 => Ok(body),
@@ -125,11 +123,8 @@ fn object(
     answer: Result<(u16, impl AsRef<[u8]>), GetError>,
 ) -> Result<Value, CliError> {
     let body = body_of(program, address, answer)?;
-    let unexpected = |reason: String| CliError::Answer {
-        program,
-        address: address.to_string(),
-        reason,
-    };
+    let unexpected =
+        |reason: String| CliError::Answer { program, address: address.to_string(), reason };
     let value: Value = serde_json::from_slice(body.as_ref())
         .map_err(|error| unexpected(format!("no JSON: {error}")))?;
     if value.is_object() {
