@@ -19,7 +19,9 @@ use blaze_domain::{FlowId, Scope, ServiceName};
 use blaze_runtime::config::Keys;
 use blaze_runtime::main_service::MainService;
 use blaze_runtime::{CheckStatus, Gate, Readiness, Supervisor, TaskPolicy};
-use blaze_sdk::{ProgramConfig, SdkError, ServiceManager, ServiceOptions};
+use blaze_sdk::{
+    MetricsEndpoint, ProgramConfig, SdkError, ServiceManager, ServiceOptions,
+};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
@@ -256,6 +258,8 @@ async fn on_broker(
 ) -> anyhow::Result<Arc<ServiceManager>> {
     let name: ServiceName = NAME.parse()?;
     let options = ServiceOptions {
+        // Its own page has all that a page of the SDK would have.
+        metrics: MetricsEndpoint::Off,
         pool_threads: 2,
         epoch: shared.epoch,
         supervisor: Some(supervisor.clone()),
