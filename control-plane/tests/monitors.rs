@@ -146,7 +146,8 @@ mod long {
             .step_by(10)
             .map(|topic| {
                 json!({
-                    "code": "topic_silent", "scope": "topic", "name": format!("sensors/topic-{topic}"),
+                    "code": "topic_silent", "scope": "topic",
+                    "name": format!("sensors/topic-{topic}"),
                     "state": "degraded", "since": "2026-01-01T00:00:00.000Z",
                     "detail": "no message for 10 s, 50 Hz are advertised",
                     "remedy": "Check the publisher.",

@@ -80,7 +80,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn snapshot_and_deltas_are_the_newest(pictures in proptest::collection::vec(any_json(), 2..8)) {
+        fn snapshot_and_deltas_are_the_newest(
+            pictures in proptest::collection::vec(any_json(), 2..8),
+        ) {
             let pictures: Vec<Value> = pictures
                 .into_iter()
                 .map(|picture| without_nulls(json!({ "x": picture })))

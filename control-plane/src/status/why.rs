@@ -1,5 +1,5 @@
-//! `why` over several flows: the answers of the publisher's and of the consumer's flow as one way of
-//! hops, with the rates that their bridges had meanwhile. Pure.
+//! `why` over several flows: the answers of the publisher's and of the consumer's flow as one way
+//! of hops, with the rates that their bridges had meanwhile. Pure.
 //!
 //! ```text
 //! /v1/why of each flow ─▶ steps ─▶ hops, once each; what a flow says of itself counts

@@ -1,5 +1,5 @@
-//! The methods of `blaze.v1.ConfigService`, `SyncService` and `StatusService`: what right each needs. A method that is not in this
-//! table is not served.
+//! The methods of `blaze.v1.ConfigService`, `SyncService` and `StatusService`: what right each
+//! needs. A method that is not in this table is not served.
 
 use crate::auth::Right;
 

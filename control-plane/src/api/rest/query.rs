@@ -63,7 +63,8 @@ params! {
     Name = "name", "Only documents of this name.";
     TimeoutS = "timeout_s", "Ends the stream cleanly after so many seconds.";
     DigestLayer = "layer", "Layer whose view is digested.";
-    LiveView = "view", "What is looked at; default: fleet. `node` needs `node`, `topic` needs `topic`.";
+    LiveView = "view", "What is looked at; default: fleet. `node` needs `node`, `topic` \
+        needs `topic`.";
     LiveNode = "node", "Only this node.";
     LiveTopic = "topic", "Name of a topic.";
     PeriodMs = "period_ms", "Milliseconds between two deltas, at least.";

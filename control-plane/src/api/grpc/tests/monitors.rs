@@ -304,7 +304,10 @@ async fn answer_as_flow(monitor: &mut Monitor, queries: usize) -> Vec<String> {
                 "verdict": "not_flowing", "code": "no_request", "remedy": "Start a service.",
                 "steps": [
                     { "flow": "edge/robot-1", "step": "advertise", "ok": true, "code": "ok" },
-                    { "flow": "cloud/cloud-1", "step": "request", "ok": false, "code": "no_request" },
+                    {
+                        "flow": "cloud/cloud-1", "step": "request", "ok": false,
+                        "code": "no_request",
+                    },
                 ],
             }),
             _ => json!({ "bridges": [] }),
