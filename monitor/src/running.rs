@@ -19,9 +19,7 @@ use blaze_domain::{FlowId, Scope, ServiceName};
 use blaze_runtime::config::Keys;
 use blaze_runtime::main_service::MainService;
 use blaze_runtime::{CheckStatus, Gate, Readiness, Supervisor, TaskPolicy};
-use blaze_sdk::{
-    MetricsEndpoint, ProgramConfig, SdkError, ServiceManager, ServiceOptions,
-};
+use blaze_sdk::{MetricsEndpoint, ProgramConfig, SdkError, ServiceManager, ServiceOptions};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 

@@ -11,6 +11,7 @@ mod guard;
 pub mod ledger;
 pub mod machine;
 mod memory;
+pub mod monitor;
 pub mod network;
 pub mod plain;
 pub mod process;

@@ -4,3 +4,4 @@
 mod drain;
 mod edge_to_edge;
 mod json;
+mod monitor;
