@@ -142,8 +142,11 @@ async fn the_main_service_has_the_state_of_a_node_that_reports() -> anyhow::Resu
     let folder = tempfile::tempdir()?;
     let main = MainService::start(folder.path(), &MainStore::Sqlite)?;
     let api = main.api()?;
-    api.replace("/api/v1/layers/edge", json!({"kind": "edge"})).await?;
-    api.replace("/api/v1/nodes/robot-1", json!({"layer": "edge"})).await?;
+    api.apply(&[
+        json!({"kind": "Layer", "name": "edge", "spec": {"kind": "edge"}}),
+        json!({"kind": "Node", "name": "robot-1", "spec": {"layer": "edge"}}),
+    ])
+    .await?;
     let pair = tokio::task::spawn_blocking(Pair::start).await??;
     let reporting = format!("{SECTION}config: {{ server: \"{}\" }}\n", main.server());
     let robot = MonitorProcess::beside(&pair.robot, &reporting)?;
@@ -154,7 +157,7 @@ async fn the_main_service_has_the_state_of_a_node_that_reports() -> anyhow::Resu
         }
     };
     tokio::time::timeout(SOON, waiting).await?;
-    let health = api.get("/api/v1/series?node=robot-1&names=").await?;
+    let health = api.get("/series?node=robot-1&names=").await?;
     assert_eq!((&health["layer"], &health["node"]), (&json!("edge"), &json!("robot-1")));
     let request = json!({"op":"request","topic":"scan","service":"log","ttl_s":0,"type":"b/msg/B"});
     let offer = json!({"op":"advertise","topic":"scan","service":"a","ttl_s":0,"type":"a/msg/A"});
@@ -162,7 +165,7 @@ async fn the_main_service_has_the_state_of_a_node_that_reports() -> anyhow::Resu
     pair.tell("robot-1", &offer)?;
     let problem = async {
         loop {
-            let problems = api.get("/api/v1/problems").await?;
+            let problems = api.get("/problems").await?;
             let rows = problems["items"].as_array().cloned().unwrap_or_default();
             match rows.into_iter().find(|row| row["code"] == "type_mismatch") {
                 Some(row) => return anyhow::Ok(row),
@@ -175,7 +178,7 @@ async fn the_main_service_has_the_state_of_a_node_that_reports() -> anyhow::Resu
         (&row["layer"], &row["node"], &row["name"]),
         (&json!("edge"), &json!("robot-1"), &json!("scan"))
     );
-    let why = api.get("/api/v1/why?topic=scan&from=edge/robot-1&to=cloud").await?;
+    let why = api.get("/why?topic=scan&from=edge/robot-1&to=cloud").await?;
     assert_eq!(
         (&why["verdict"], &why["code"]),
         (&json!("not_flowing"), &json!("type_mismatch")),
