@@ -16,11 +16,13 @@ use blaze_brokers::Broker;
 use blaze_brokers::redis::RedisKeys;
 use blaze_config::process::Setup;
 use blaze_config::running::{Addresses, RunningMain};
-use blaze_domain::InstanceName;
+use blaze_domain::{InstanceName, Scope};
 use blaze_domain::node_file::{ControlPlaneSection, NodeFile, RedisBroker};
 use blaze_flow::flow::RunningFlow;
 use blaze_flow::flow::node_file::Followed;
 use blaze_flow::flow::service::FlowService;
+use blaze_monitor::node::Roots;
+use blaze_monitor::running::{MonitorOptions, RunningMonitor};
 use blaze_runtime::config::Verdict;
 use blaze_runtime::logs::LogHandle;
 use blaze_runtime::{Readiness, Supervisor, environment};
@@ -81,6 +83,26 @@ pub(crate) async fn follow(
     let service = FlowService::follow(flow, followed, cache.cloned(), supervisor, judged).await;
     let service = service.map_err(|error| refused(error.to_string()))?;
     service.ok_or_else(|| refused("it has no broker of its node or layer".to_owned()))
+}
+
+/// Starts the monitor of a node whose flow is in this process, on the broker of its services.
+///
+/// # Errors
+/// [`CliError::Failed`]: a port that cannot be used.
+pub(crate) async fn start_monitor(
+    mut file: NodeFile,
+    flow: SocketAddr,
+    broker: Arc<dyn Broker>,
+    supervisor: &Supervisor,
+) -> Result<RunningMonitor, CliError> {
+    file.admin.flow = flow;
+    let address = file.admin.monitor;
+    let broker = Some((Scope::Node, broker));
+    let options = MonitorOptions { file, roots: Roots::default(), broker };
+    let monitor = RunningMonitor::start(options, supervisor).await;
+    monitor.map_err(|error| {
+        CliError::Failed(format!("the monitor does not start on {address}: {error:#}"))
+    })
 }
 
 /// Which instance of its programs this process is.

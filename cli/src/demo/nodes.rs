@@ -4,8 +4,11 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_domain::Scope;
+use blaze_domain::node_file::NodeFile;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
+use blaze_monitor::running::RunningMonitor;
 use blaze_runtime::Supervisor;
 use blaze_runtime::config::Sources;
 use futures::future::join_all;
@@ -15,6 +18,7 @@ use super::brokers::{BrokerSource, NodeBrokers};
 use super::domain_id::{self, DEFAULT_DOMAIN, ReservedDomain};
 use super::options::{DemoNode, DemoOptions};
 use super::roles::{PUBLISHING_NODE, ROS2_NODE};
+use crate::embedded::start_monitor;
 use crate::exit::CliError;
 use crate::node_file;
 
@@ -30,6 +34,7 @@ pub(super) struct RunningNode {
     pub(super) limit_mbps: f64,
     pub(super) brokers: NodeBrokers,
     pub(super) flow: Arc<RunningFlow>,
+    monitor: RunningMonitor,
     pub(super) supervisor: Supervisor,
 }
 
@@ -70,14 +75,14 @@ pub(super) async fn start_nodes(
         None => DEFAULT_DOMAIN,
     };
     // Settings of all nodes first: a faulty --set is told before anything runs.
-    let settings: Vec<(DemoNode, (FlowSettings, Value))> = options
+    let settings: Vec<(DemoNode, (FlowSettings, NodeFile, Value))> = options
         .nodes()
         .into_iter()
         .map(|node| Ok((node, settings_of(node, options, listen, domain)?)))
         .collect::<Result<_, CliError>>()?;
     let mut source = BrokerSource::new(options.brokers)?;
     let mut running = Vec::new();
-    for (node, (settings, file)) in settings {
+    for (node, (settings, of_monitor, file)) in settings {
         let limit_mbps = settings.live.bandwidth.limit_mbps;
         let epochs = Epochs::begin(&settings.me, None);
         let brokers = source.of(node, &settings.me, epochs.first())?;
@@ -93,12 +98,15 @@ pub(super) async fn start_nodes(
             blaze_flow::flow::start_with(flow_options, beginning, of_node.clone()).await.map_err(
                 |error| CliError::Failed(format!("{} does not start: {error:#}", node.name())),
             )?;
+        let broker = Arc::clone(brokers.of_services(Scope::Node));
+        let monitor = start_monitor(of_monitor, flow.admin(), broker, &of_node).await?;
         running.push(RunningNode {
             node,
             file,
             limit_mbps,
             brokers,
             flow: Arc::new(flow),
+            monitor,
             supervisor: of_node,
         });
     }
@@ -111,7 +119,7 @@ fn settings_of(
     options: &DemoOptions,
     listen: Ipv4Addr,
     domain: u16,
-) -> Result<(FlowSettings, Value), CliError> {
+) -> Result<(FlowSettings, NodeFile, Value), CliError> {
     let peers: Vec<String> = options.peer.iter().map(|peer| format!("\"{peer}\"")).collect();
     let (layer, name, peers) = (node.layer(), node.name(), peers.join(", "));
     let own = [
@@ -124,6 +132,7 @@ fn settings_of(
             format!("{{ dds: {{ domain: {domain}, listen: \"{listen}\", peers: [{peers}] }} }}"),
         ),
         ("admin.flow", "\"127.0.0.1:0\"".to_owned()),
+        ("admin.monitor", "\"127.0.0.1:0\"".to_owned()),
     ];
     let ros2 = options.ros2.filter(|_| node == ROS2_NODE);
     let ros2 =
@@ -142,7 +151,7 @@ fn settings_of(
         .map_err(|faults| CliError::Usage(format!("--set: {faults}")))?;
     let settings = FlowSettings::try_from(&file)
         .map_err(|error| CliError::Usage(format!("--set: {error}")))?;
-    Ok((settings, tree))
+    Ok((settings, file, tree))
 }
 
 /// Waits until all of them are ready, and says where they are asked.
@@ -161,7 +170,8 @@ pub(super) async fn wait_ready(nodes: &Nodes, ros2: Option<u16>) -> Result<(), C
         })?;
         let ros2 = ros2.filter(|_| running.node == ROS2_NODE);
         let ros2 = ros2.map(|domain| format!(" ros2={domain}")).unwrap_or_default();
-        eprintln!("ready node={name} admin={}{ros2}", running.flow.admin());
+        let (admin, monitor) = (running.flow.admin(), running.monitor.admin());
+        eprintln!("ready node={name} admin={admin} monitor={monitor}{ros2}");
     }
     Ok(())
 }
@@ -175,6 +185,7 @@ impl Nodes {
     /// Drains the flows, then closes their brokers.
     pub(super) async fn shutdown(self) {
         join_all(self.running.into_iter().map(|running| async move {
+            running.monitor.stop().await;
             running.flow.drain().await;
             running.supervisor.shutdown(Duration::from_secs(1)).await;
             running.brokers.close().await;

@@ -1,8 +1,8 @@
 //! What `blaze dev` is put together of, and in which order it begins and ends.
 //!
 //! ```text
-//! broker ─► main service ─► documents ─► worker ─► flow, which follows BlazeConfig ─► ready
-//! end: flow drained ─► worker's copies ─► requests of the main service, its store ─► broker
+//! broker ─► main service ─► documents ─► worker ─► flow, which follows BlazeConfig ─► monitor ─► ready
+//! end: monitor ─► flow drained ─► worker's copies ─► requests of the main service, its store ─► broker
 //! ```
 
 use std::net::SocketAddr;
@@ -18,6 +18,7 @@ use blaze_domain::node_file::{NodeBroker, NodeFile};
 use blaze_flow::flow::service::FlowService;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
+use blaze_monitor::running::RunningMonitor;
 use blaze_runtime::Supervisor;
 use blaze_runtime::logs::{self, LogFormat};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps};
@@ -27,7 +28,7 @@ use super::options::{DevBroker, DevOptions};
 use super::redis;
 use crate::config::files::Source;
 use crate::config::seed;
-use crate::embedded::{Worker, follow, instance, start_main};
+use crate::embedded::{Worker, follow, instance, start_main, start_monitor};
 use crate::exit::CliError;
 
 /// How long worker and flow may take.
@@ -40,6 +41,7 @@ pub(super) struct Dev {
     worker: Arc<Worker>,
     flow: Arc<RunningFlow>,
     service: FlowService,
+    monitor: RunningMonitor,
     /// URL of the Redis; `None`: memory.
     redis: Option<String>,
 }
@@ -70,6 +72,10 @@ pub(super) async fn start(
         Worker::start(&file, brokers.open(&Role::Worker)?, folder, true, supervisor).await?;
     let flow = Arc::new(start_flow(&file, &brokers, options.data.as_deref(), supervisor).await?);
     let service = follow(&flow, &tree, file.cache_redis(), Some(log), supervisor, |_| {}).await?;
+    let mut of_monitor = file.clone();
+    of_monitor.admin.worker = worker.admin.unwrap_or(file.admin.worker);
+    let broker = brokers.open(&Role::Service)?;
+    let monitor = start_monitor(of_monitor, flow.admin(), broker, supervisor).await?;
     worker.has(revision, READY).await?;
     tokio::time::timeout(READY, flow.ready()).await.map_err(|_| {
         let (waited, admin) = (READY.as_secs(), flow.admin());
@@ -77,7 +83,7 @@ pub(super) async fn start(
             "the flow was not ready within {waited} s; see http://{admin}/readyz"
         ))
     })?;
-    Ok(Dev { main, addresses, worker: Arc::new(worker), flow, service, redis })
+    Ok(Dev { main, addresses, worker: Arc::new(worker), flow, service, monitor, redis })
 }
 
 /// URL of the Redis, which is started where that is asked for; `None`: memory.
@@ -182,6 +188,7 @@ impl Dev {
         ];
         places.extend(self.worker.admin.map(|worker| ("worker", worker.to_string())));
         places.push(("flow", self.flow.admin().to_string()));
+        places.push(("monitor", self.monitor.admin().to_string()));
         places.push(("broker", self.redis.clone().unwrap_or_else(|| "memory".to_owned())));
         places
     }
@@ -209,11 +216,12 @@ impl Dev {
 
     /// Ends everything in order.
     pub(super) async fn shutdown(self, supervisor: &Supervisor, deadline: Duration) {
-        let Self { main, worker, flow, service, .. } = self;
+        let Self { main, worker, flow, service, monitor, .. } = self;
         let readiness = flow.readiness().clone();
         let steps = ShutdownSteps::new(deadline)
             .on(ShutdownPhase::NotReady, "flow", async move { readiness.stop() })
             .on(ShutdownPhase::Drain, "flow", async move {
+                monitor.stop().await;
                 service.stop().await;
                 flow.drain().await;
             })

@@ -31,6 +31,9 @@ pub enum Presence {
     Gone,
 }
 
+/// Counts of links, by their two flows.
+type LinkCounts = BTreeMap<(FlowId, FlowId), u64>;
+
 /// A node that has reported since this process started.
 #[derive(Debug)]
 pub struct Entry {
@@ -43,7 +46,7 @@ pub struct Entry {
     /// Messages per second, from the last two summaries.
     pub rates: Rates,
     /// Messages that links had dropped by the summary before, where somebody looked at it.
-    pub dropped_before: Option<(Now, BTreeMap<(FlowId, FlowId), u64>)>,
+    pub dropped_before: Option<(Now, LinkCounts)>,
     /// Where its metrics are scraped; empty: not from outside.
     pub metrics_address: String,
     presence: Damped<Presence>,
@@ -207,7 +210,7 @@ impl Fleet {
             let kind = held.document.spec_member("kind").and_then(|kind| kind.as_str());
             let kind = kind.unwrap_or_default().to_owned();
             let health = match before.remove(&layer) {
-                Some(known) => LayerHealth { kind, ..known },
+                Some(known) => known.with_kind(kind),
                 None => LayerHealth::new(kind, now),
             };
             self.layers.insert(layer, health);

@@ -44,6 +44,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze-auth",
             "blaze-config",
             "blaze-worker",
+            "blaze-monitor",
         ],
     ),
     (
