@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use axum::body::Bytes;
 use axum::extract::{Query, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse as _, Response};
@@ -78,7 +79,7 @@ fn fifth_of_a_second() -> u64 {
     200
 }
 
-async fn ping(State(shared): App, body: axum::body::Bytes) -> Response {
+async fn ping(State(shared): App, body: Bytes) -> Response {
     let order: Order = match serde_json::from_slice(&body) {
         Ok(order) => order,
         Err(error) => {
@@ -96,7 +97,7 @@ async fn ping(State(shared): App, body: axum::body::Bytes) -> Response {
             let (status, code) = match &error {
                 OrderError::Busy => (StatusCode::CONFLICT, "busy"),
                 OrderError::Unknown(_) => (StatusCode::NOT_FOUND, "not_found"),
-                _ => (StatusCode::BAD_REQUEST, "invalid_request"),
+                OrderError::Invalid => (StatusCode::BAD_REQUEST, "invalid_request"),
             };
             refusal(status, code, &error.to_string())
         }
@@ -110,30 +111,17 @@ fn refusal(status: StatusCode, code: &str, detail: &str) -> Response {
 /// The pages of all programs of this node, and of services that name one, as one page.
 async fn all_pages(shared: &Shared, own: &str) -> String {
     let asked = asked(shared);
-    let pages = futures::stream::iter(asked)
-        .map(|(address, labels)| async move {
-            let limits = GetLimits { bytes: MAX_PAGE_BYTES, ..ANSWER };
-            match http_get(&address, "/metrics", limits).await {
-                Ok((200, body)) => Some((body, labels)),
-                Ok((status, _)) => {
-                    tracing::debug!(address, status, "no page of metrics");
-                    None
-                }
-                Err(error) => {
-                    tracing::debug!(address, %error, "no page of metrics");
-                    None
-                }
-            }
-        })
+    let pages: Vec<_> = futures::stream::iter(asked)
+        .map(page_of)
         .buffered(AT_ONCE)
         .filter_map(|page| async { page })
-        .collect::<Vec<_>>()
+        .collect()
         .await;
     let mut merged = Merged::default();
     merged.add(own, &[("program", "blaze-monitor")]);
     for (body, labels) in &pages {
         let labels: Vec<(&str, &str)> =
-            labels.iter().map(|(name, value)| (*name, value.as_str())).collect();
+            labels.iter().map(|(name, value)| (name.as_str(), value.as_str())).collect();
         merged.add(&String::from_utf8_lossy(body), &labels);
     }
     if merged.refused() > 0 {
@@ -142,28 +130,39 @@ async fn all_pages(shared: &Shared, own: &str) -> String {
     merged.text()
 }
 
-type Labels = Vec<(&'static str, String)>;
+async fn page_of((address, labels): (String, Labels)) -> Option<(Bytes, Labels)> {
+    let limits = GetLimits { bytes: MAX_PAGE_BYTES, ..ANSWER };
+    let refused = match http_get(&address, "/metrics", limits).await {
+        Ok((200, body)) => return Some((body, labels)),
+        Ok((status, _)) => format!("status {status}"),
+        Err(error) => error.to_string(),
+    };
+    tracing::debug!(address, refused, "no page of metrics");
+    None
+}
+
+type Labels = Vec<(String, String)>;
 
 /// Addresses of the pages, with the labels of their series.
 fn asked(shared: &Shared) -> Vec<(String, Labels)> {
     let programs = shared.programs();
-    let program = |name: &str| ("program", name.to_owned());
+    let label = |name: &str, value: &str| (name.to_owned(), value.to_owned());
     let are_several = programs.flows.len() > 1;
     let flows = programs.flows.iter().filter(|flow| flow.summary.is_some()).map(|flow| {
         let name = flow.name.as_ref().filter(|_| are_several);
-        let labels = name.map(|name| ("flow", name.to_string())).into_iter();
-        (flow.address.clone(), [program("blaze-flow")].into_iter().chain(labels).collect())
+        let labels = name.map(|name| label("flow", &name.to_string())).into_iter();
+        (flow.address.clone(), [label("program", "blaze-flow")].into_iter().chain(labels).collect())
     });
     let worker = programs
         .worker
         .is_reachable
-        .then(|| (shared.live().worker.clone(), vec![program("blaze-worker")]));
+        .then(|| (shared.live().worker.clone(), vec![label("program", "blaze-worker")]));
     let signs = shared.signs.now(Instant::now()).unwrap_or_default();
     let services = signs.into_iter().filter_map(|sign| {
         // Elsewhere it would be somebody else's port: who may write a sign of life decides where
         // this program connects to.
         let address: SocketAddr = sign.metrics.parse().ok()?;
-        let labels = vec![("service", sign.service), ("instance", sign.instance)];
+        let labels = vec![label("service", &sign.service), label("instance", &sign.instance)];
         address.ip().is_loopback().then(|| (address.to_string(), labels))
     });
     flows.chain(worker).chain(services).take(MAX_PAGES).collect()

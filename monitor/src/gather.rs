@@ -181,7 +181,7 @@ pub fn vitals(of_node: node::Vitals, offsets: Vec<OffsetInput>) -> Vitals {
         hottest: of_node.celsius_max,
         clock_error_s: of_node.clock_error_s.filter(|_| of_node.clock_synchronized == Some(true)),
         offsets,
-        udp_buffer_errors: of_node.udp_buffer_errors_total,
+        udp_buffer_errors: of_node.udp_buffer_errors_total.map(|count| count as u64),
         throttled_s: of_node.cgroup_throttled_s_total,
     }
 }

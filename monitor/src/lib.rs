@@ -1,25 +1,26 @@
 //! BlazeMonitoring on one node: values of the node, pings to other nodes, latency of messages,
 //! health. ARCHITECTURE.md has the map.
 
-mod admin;
-mod gather;
+pub mod admin;
+pub mod gather;
 pub mod health;
-mod history;
+pub mod history;
 pub mod latency;
 pub mod limits;
-mod look;
+pub mod look;
 pub mod metric;
 pub mod node;
-mod page;
+pub mod page;
 pub mod ping;
-mod pings;
-mod programs;
+pub mod pings;
+pub mod programs;
 pub mod report;
 pub mod running;
-mod services;
+pub mod services;
 pub mod settings;
-mod shared;
-mod subscriber;
+pub mod shared;
+pub mod subscriber;
+mod tasks;
 
 pub use shared::all_metrics;
 

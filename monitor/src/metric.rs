@@ -32,7 +32,7 @@ impl Kind {
 }
 
 /// One metric. `/metrics` and the documentation are made of such tables.
-#[derive(Debug)]
+#[derive(Debug, PartialEq, Eq)]
 pub struct Metric {
     /// Name, without labels.
     pub name: &'static str,

@@ -8,15 +8,15 @@ use std::time::{Duration, Instant, SystemTime};
 
 use blaze_domain::{FlowId, Priority, TopicName};
 use blaze_sdk::{
-    Advertise, FlowManager, LocalBroker, Message, PublishOptions, Publisher, Request,
+    Advertise, FlowManager, LocalBroker, Message, PublishOptions, Publisher, Request, SdkError,
     SubscribeOptions,
 };
 use parking_lot::Mutex;
 use tokio::sync::Notify;
-use tokio_util::task::AbortOnDropHandle;
 
 use crate::limits::PING_QUEUE;
 use crate::ping::{Engine, Now, OrderError, Output, PingSample, Settings};
+use crate::tasks::Tasks;
 
 /// A ping or an answer is of no use later: it counts as lost then.
 const LIFESPAN: Duration = Duration::from_secs(5);
@@ -125,70 +125,61 @@ impl<F: FnMut()> Drop for Cancel<F> {
 
 /// Pings through a broker, for ever.
 pub async fn run(pings: Arc<Pings>, broker: LocalBroker, flow: FlowManager) {
-    let mut requested: BTreeMap<TopicName, AbortOnDropHandle<()>> = BTreeMap::new();
-    let mut advertised: BTreeMap<TopicName, Advertised> = BTreeMap::new();
+    let mut requested = Tasks::default();
+    let mut advertised = Tasks::default();
+    let mut publishers: BTreeMap<TopicName, Publisher> = BTreeMap::new();
     loop {
         let (outputs, changes, wait) = pings.poll();
-        for topic in changes.release {
-            requested.remove(&topic);
-        }
-        for topic in changes.withdraw {
-            advertised.remove(&topic);
+        changes.release.iter().for_each(|topic| requested.end(topic));
+        for topic in &changes.withdraw {
+            advertised.end(topic);
+            publishers.remove(topic);
         }
         for topic in changes.request {
             let task = request(Arc::clone(&pings), broker.clone(), flow.clone(), topic.clone());
-            requested.insert(topic, AbortOnDropHandle::new(tokio::spawn(task)));
+            requested.start(topic, task);
         }
         for topic in changes.advertise {
-            match Advertised::new(&broker, &flow, &topic) {
-                Ok(made) => drop(advertised.insert(topic, made)),
+            match publisher(&broker, &topic) {
+                Ok(publisher) => drop(publishers.insert(topic.clone(), publisher)),
                 Err(error) => tracing::error!(%error, %topic, "pings cannot be published"),
             }
+            advertised.start(topic.clone(), advertise(flow.clone(), topic));
         }
         for output in outputs {
-            if let Some(advertised) = advertised.get(&output.topic()) {
-                advertised.publisher.publish(output.payload());
+            if let Some(publisher) = publishers.get(&output.topic()) {
+                publisher.publish(output.payload());
             }
         }
         tokio::select! {
             () = tokio::time::sleep(wait) => {}
             () = pings.wake.notified() => {}
+            () = requested.ended() => {}
+            () = advertised.ended() => {}
         }
     }
 }
 
-/// A topic that is published, and the task that holds its lease.
-struct Advertised {
-    publisher: Publisher,
-    _lease: AbortOnDropHandle<()>,
+fn publisher(broker: &LocalBroker, topic: &TopicName) -> Result<Publisher, SdkError> {
+    let options = PublishOptions {
+        encoding: ENCODING.to_owned(),
+        lifespan: LIFESPAN,
+        priority: Some(Priority::State),
+        ..PublishOptions::default()
+    };
+    broker.publisher(topic, &options)
 }
 
-impl Advertised {
-    fn new(
-        broker: &LocalBroker,
-        flow: &FlowManager,
-        topic: &TopicName,
-    ) -> Result<Self, blaze_sdk::SdkError> {
-        let options = PublishOptions {
-            encoding: ENCODING.to_owned(),
-            lifespan: LIFESPAN,
-            priority: Some(Priority::State),
-            ..PublishOptions::default()
-        };
-        let publisher = broker.publisher(topic, &options)?;
-        let advertise = Advertise {
-            encoding: ENCODING.to_owned(),
-            lifespan: LIFESPAN,
-            priority: Some(Priority::State),
-            ..Advertise::new(topic.clone())
-        };
-        let flow = flow.clone();
-        let lease = tokio::spawn(async move {
-            let _lease = until_held(|| flow.advertise(advertise.clone())).await;
-            std::future::pending().await
-        });
-        Ok(Self { publisher, _lease: AbortOnDropHandle::new(lease) })
-    }
+/// Holds an advertisement until it is aborted.
+async fn advertise(flow: FlowManager, topic: TopicName) {
+    let advertise = Advertise {
+        encoding: ENCODING.to_owned(),
+        lifespan: LIFESPAN,
+        priority: Some(Priority::State),
+        ..Advertise::new(topic)
+    };
+    let _lease = until_held(|| flow.advertise(advertise.clone())).await;
+    std::future::pending::<()>().await;
 }
 
 /// Subscribes and requests a topic until it is aborted.
@@ -216,7 +207,7 @@ async fn request(pings: Arc<Pings>, broker: LocalBroker, flow: FlowManager, topi
         ..Request::new(topic.clone())
     };
     let _lease = until_held(|| flow.request(request.clone())).await;
-    std::future::pending().await
+    std::future::pending::<()>().await;
 }
 
 /// Tries again until a flow agrees. A monitor without a flow pings those on its broker.

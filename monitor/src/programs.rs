@@ -76,7 +76,7 @@ impl Programs {
         let flows = futures::stream::iter(addresses)
             .map(|address| {
                 let known = before.flows.iter().find(|flow| flow.address == address);
-                look_at_flow(address, known, is_closer)
+                look_at_flow(address, known.cloned().unwrap_or_default(), is_closer)
             })
             .buffered(AT_ONCE);
         let (flows, worker) = tokio::join!(flows.collect::<Vec<_>>(), look_at_worker(worker));
@@ -115,8 +115,7 @@ async fn addresses(flows: &[String]) -> Vec<String> {
     out
 }
 
-async fn look_at_flow(address: String, before: Option<&FlowView>, is_closer: bool) -> FlowView {
-    let before = before.cloned().unwrap_or_default();
+async fn look_at_flow(address: String, before: FlowView, is_closer: bool) -> FlowView {
     let (summary, ready) = tokio::join!(json(&address, "/v1/summary", ANSWER), readiness(&address));
     let summary = match summary {
         Ok(summary) => summary,
@@ -152,16 +151,19 @@ async fn look_at_flow(address: String, before: Option<&FlowView>, is_closer: boo
 async fn blocked(address: &str) -> Vec<Value> {
     let topics = rows(address, "/v1/topics?state=blocked", "topics").await;
     let names = topics.iter().filter(|row| row["state"] == "blocked");
-    let names: Vec<&str> =
-        names.filter_map(|row| row["topic"].as_str()).take(MAX_BLOCKED).collect();
+    let names = names.filter_map(|row| Some(row["topic"].as_str()?.to_owned()));
+    let names: Vec<String> = names.take(MAX_BLOCKED).collect();
+    let address = address.to_owned();
     futures::stream::iter(names)
-        .map(|topic| async move {
-            json(address, &format!("/v1/why?topic={topic}"), ANSWER).await.ok()
-        })
+        .map(move |topic| why(address.clone(), topic))
         .buffered(AT_ONCE)
         .filter_map(|why| async { why })
         .collect()
         .await
+}
+
+async fn why(address: String, topic: String) -> Option<Value> {
+    json(&address, &format!("/v1/why?topic={topic}"), ANSWER).await.ok()
 }
 
 async fn look_at_worker(address: &str) -> WorkerView {

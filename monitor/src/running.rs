@@ -198,9 +198,9 @@ fn metrics_address(admin: SocketAddr, file: &NodeFile) -> String {
     if !admin.ip().is_unspecified() {
         return admin.to_string();
     }
-    let interface = file.brokers.inter.as_ref().map(|inter| inter.interface);
+    let interface = file.brokers.inter.as_ref().map(|inter| inter.listen);
     match interface.filter(|ip| !ip.is_unspecified()) {
-        Some(ip) => SocketAddr::new(ip, admin.port()).to_string(),
+        Some(ip) => SocketAddr::new(ip.into(), admin.port()).to_string(),
         None => {
             let host = rustix::system::uname().nodename().to_string_lossy().into_owned();
             format!("{host}:{}", admin.port())
@@ -218,7 +218,7 @@ fn spawn(supervisor: &Supervisor, name: &str, task: impl Future<Output = ()> + S
     });
 }
 
-async fn sample(shared: Arc<Shared>, mut sampler: Sampler) {
+async fn sample(shared: Arc<Shared>, sampler: Sampler) {
     let mut live = shared.live_changes();
     let mut period = sample_period(&shared);
     let mut is_first = true;
@@ -302,8 +302,13 @@ async fn on_broker(
             let rules = shared.live().section.latency.clone();
             let known: BTreeSet<_> = shared.known_topics();
             subscribed.follow(&rules, known, (&broker_of, &flow_of), &meter);
-            if looks.changed().await.is_err() {
-                return;
+            tokio::select! {
+                changed = looks.changed() => {
+                    if changed.is_err() {
+                        return;
+                    }
+                }
+                () = subscribed.ended() => {}
             }
         }
     });

@@ -210,7 +210,7 @@ impl Shared {
     /// `/v1/ping`.
     #[must_use]
     pub fn ping(&self) -> Value {
-        self.answer(self.pings.read(|engine, now| engine.view(now)))
+        self.answer(self.pings.read(ping::Engine::view))
     }
 
     /// `/v1/latency`.

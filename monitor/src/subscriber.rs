@@ -9,11 +9,11 @@ use blaze_domain::node_file::{LatencyRule, Observe, Stamp};
 use blaze_domain::{FlowId, TopicName};
 use blaze_sdk::{FlowManager, LocalBroker, Message, Request, SubscribeOptions};
 use parking_lot::Mutex;
-use tokio_util::task::AbortOnDropHandle;
 
 use crate::latency::{Latency, Message as Measured, Offset, header_stamp_cdr, header_stamp_json};
 use crate::limits::{LATENCY_QUEUE, MAX_LATENCY_TOPICS};
 use crate::pings::{Pings, until_held};
+use crate::tasks::Tasks;
 
 /// Between two tries to subscribe.
 const AGAIN: Duration = Duration::from_secs(1);
@@ -32,7 +32,8 @@ pub struct Meter {
 /// The topics that are subscribed now. Dropping it ends them.
 #[derive(Default)]
 pub struct Subscribed {
-    tasks: BTreeMap<TopicName, (LatencyRule, AbortOnDropHandle<()>)>,
+    rules: BTreeMap<TopicName, LatencyRule>,
+    tasks: Tasks,
 }
 
 impl Subscribed {
@@ -55,14 +56,25 @@ impl Subscribed {
                 wanted.insert(topic, rule.clone());
             }
         }
-        self.tasks.retain(|topic, (rule, _)| wanted.get(topic) == Some(rule));
+        self.rules.retain(|topic, rule| {
+            let stays = wanted.get(topic) == Some(rule);
+            if !stays {
+                self.tasks.end(topic);
+            }
+            stays
+        });
         for (topic, rule) in wanted {
-            self.tasks.entry(topic.clone()).or_insert_with(|| {
+            if self.rules.insert(topic.clone(), rule.clone()).is_none() {
                 let task =
-                    subscribe(topic, rule.clone(), broker.clone(), flow.clone(), meter.clone());
-                (rule, AbortOnDropHandle::new(tokio::spawn(task)))
-            });
+                    subscribe(topic.clone(), rule, broker.clone(), flow.clone(), meter.clone());
+                self.tasks.start(topic, task);
+            }
         }
+    }
+
+    /// Waits for a task that ended, which none does by itself.
+    pub async fn ended(&mut self) {
+        self.tasks.ended().await;
     }
 }
 
@@ -91,7 +103,7 @@ async fn subscribe(
     };
     let request = Request { max_rate_hz: rule.max_rate_hz, ..Request::new(topic) };
     let _lease = until_held(|| flow.request(request.clone())).await;
-    std::future::pending().await
+    std::future::pending::<()>().await;
 }
 
 impl Meter {
