@@ -150,7 +150,7 @@ pub fn format_object(
 /// output is a terminal, JSON is one line, YAML a document.
 ///
 /// # Errors
-/// As [`print`] and [`format_object`].
+/// As [`print()`] and [`format_object`].
 pub fn print_look(
     value: &Value,
     format: Format,

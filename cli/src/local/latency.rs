@@ -6,6 +6,7 @@
 //! /v1/ping of the monitor ─► offsets of clocks ─┘
 //! ```
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -23,7 +24,9 @@ use crate::args::FlowAddress;
 use crate::config::text::note;
 use crate::ends::interrupted;
 use crate::exit::{CliError, Exit};
-use crate::monitor::{CsvFile, Latency, LatencyOptions, Matrix, latency_table, matrix, millis};
+use crate::monitor::{
+    CsvFile, Latency, LatencyOptions, Matrix, PingRow, latency_table, matrix, millis,
+};
 use crate::output::{self, Format, terminal_width};
 
 /// Between two figures, and two questions for the offsets of clocks.
@@ -37,7 +40,7 @@ const HEADING: [&str; 6] = ["time", "from", "sequence", "latency_ms", "error_ms"
 ///
 /// # Errors
 /// [`CliError`]: no broker, no flow, a monitor of another node, a file that cannot be written.
-pub async fn run(options: &LatencyOptions, format: Format) -> Result<Exit, CliError> {
+pub(crate) async fn run(options: &LatencyOptions, format: Format) -> Result<Exit, CliError> {
     let file = options.target.node_file()?;
     let own = file
         .flow_id()
@@ -63,10 +66,16 @@ struct Offsets<'o> {
 impl Offsets<'_> {
     /// Asks the monitor. Without one the age of messages counts, and people are told.
     async fn refresh(&mut self, meter: &Mutex<Meter>, format: Format) -> Result<(), CliError> {
-        let matrix = match timeout(OFFSETS_WITHIN, matrix(self.monitor)).await {
-            Ok(Ok(matrix)) => matrix,
-            Ok(Err(error)) => return Ok(self.away(&error.to_string(), format)),
-            Err(_) => return Ok(self.away("the monitor does not answer in time", format)),
+        let answer = timeout(OFFSETS_WITHIN, matrix(self.monitor)).await;
+        let answer = answer
+            .map_err(|_| "the monitor does not answer in time".to_owned())
+            .and_then(|answer| answer.map_err(|error| error.to_string()));
+        let matrix = match answer {
+            Ok(matrix) => matrix,
+            Err(reason) => {
+                self.away(&reason, format);
+                return Ok(());
+            }
         };
         self.is_away = false;
         if !self.own.is_written(&format!("{}/{}", matrix.layer, matrix.node)) {
@@ -88,8 +97,8 @@ impl Offsets<'_> {
     }
 }
 
-fn peers(matrix: &Matrix) -> std::collections::BTreeMap<FlowId, Peer> {
-    let peer = |row: &crate::monitor::PingRow| {
+fn peers(matrix: &Matrix) -> BTreeMap<FlowId, Peer> {
+    let peer = |row: &PingRow| {
         let clock_ms = row.clock_offset_ms.zip(row.clock_error_ms);
         Some((row.name().parse().ok()?, Peer { clock_ms, way_ms: row.latency_ms.p50 }))
     };

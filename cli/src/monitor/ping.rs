@@ -7,12 +7,13 @@ use blaze_domain::FlowId;
 use blaze_domain::control::rfc3339_millis;
 use clap::Args;
 use serde::Deserialize;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::limits::{PING_COUNT, PING_GRACE, PING_INTERVAL};
 use super::{CsvFile, MonitorTarget, Quantiles, millis, typed};
 use crate::args::FlowAddress;
 use crate::config::parse_duration;
+use crate::config::text::count;
 use crate::exit::{CliError, Exit};
 use crate::http::{get_of_monitor, post_to_monitor};
 use crate::output::{self, Align, Format, number, terminal_width};
@@ -241,8 +242,8 @@ fn samples_table(to: &FlowId, samples: &[Sample], width: Option<u16>) -> String 
     let mut latencies: Vec<f64> = samples.iter().filter_map(|sample| sample.latency_ms).collect();
     latencies.sort_unstable_by(f64::total_cmp);
     text.push_str(&format!(
-        "{to}: {} pings, {} lost, latency min {} p50 {} max {} ms\n",
-        samples.len(),
+        "{to}: {}, {} lost, latency min {} p50 {} max {} ms\n",
+        count(samples.len(), "ping"),
         samples.iter().filter(|sample| sample.lost).count(),
         number(latencies.first().copied(), 2),
         number(latencies.get(latencies.len() / 2).copied(), 2),

@@ -187,7 +187,10 @@ async fn watch(source: &Source<'_>, format: Format) -> Result<(), CliError> {
 /// Whether a failure passes by itself.
 fn passes(error: &CliError) -> bool {
     match error {
-        CliError::CannotConnect { .. } | CliError::NoServer { .. } => true,
+        // An answer that breaks off is that of a program that ends.
+        CliError::CannotConnect { .. } | CliError::Answer { .. } | CliError::NoServer { .. } => {
+            true
+        }
         CliError::Refused { status, .. } => *status >= 500,
         CliError::Problem(refusal) => refusal.status == 429 || refusal.status >= 500,
         _ => false,

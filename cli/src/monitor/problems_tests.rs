@@ -71,6 +71,22 @@ async fn the_main_service_is_asked_for_all_nodes() {
     assert_eq!(table(&[], NOW, None), "No problems.\n");
 }
 
+#[tokio::test]
+async fn a_watch_survives_a_monitor_that_ends_but_no_refusal() {
+    let stub = Stub::start(|_, before| match before {
+        0 => Reply::Cut,
+        1 => Reply::Full(503, Vec::new(), String::new()),
+        _ => Reply::Full(404, Vec::new(), String::new()),
+    })
+    .await;
+    let admin = stub.admin();
+    let source = Source::Monitor(&admin);
+    for expected in [true, true, false] {
+        let error = source.problems().await.unwrap_err();
+        assert_eq!(passes(&error), expected, "{error}");
+    }
+}
+
 #[test]
 fn changes_are_raised_and_cleared_once() {
     let mut known = Known::default();
