@@ -19,6 +19,7 @@ from common import DOWNLOADS, HOME, SCRIPTS, TEMPLATES, Failure, Pin, pins, run,
 BIN = HOME / "bin"
 # A change of how things are unpacked makes old stamps void.
 LAYOUT = "2"
+PROMETHEUS = ("prometheus", "promtool", "amtool", "prometheus-node-exporter", "alertmanager")
 FASTDDS_PEER = SCRIPTS.parent / "tests" / "peers" / "fastdds_peer.cpp"
 MAVEN_COPY = "org.apache.maven.plugins:maven-dependency-plugin:3.8.1:copy-dependencies"
 
@@ -149,6 +150,22 @@ def etcd() -> None:
     new.rename(BIN / "etcd")
     shutil.rmtree(root.parent)
     run(BIN / "etcd", "--version")
+
+
+def prometheus() -> None:
+    """Programs that need nothing beside them, but for the one that reads a template from where Debian installs it."""
+    root = HOME / "prometheus" / "root"
+    unpack_debian(pins("prometheus"), root)
+    for program in PROMETHEUS[:-1]:
+        new = BIN / f"{program}.new"
+        shutil.copy2(root / "usr" / "bin" / program, new)
+        new.rename(BIN / program)
+        (root / "usr" / "bin" / program).unlink()
+    shutil.rmtree(root / "usr" / "share" / "doc")
+    wrapper = BIN / "alertmanager"
+    shutil.copy2(TEMPLATES / "alertmanager.sh", wrapper)
+    wrapper.chmod(0o755)
+    run(BIN / "promtool", "--version")
 
 
 def fastdds() -> None:
@@ -394,6 +411,7 @@ COMPONENTS = {
     "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
     "valkey": Component(valkey, files=(BIN / "valkey-server",)),
     "etcd": Component(etcd, files=(BIN / "etcd",)),
+    "prometheus": Component(prometheus, files=tuple(BIN / name for name in PROMETHEUS), locks=(TEMPLATES / "alertmanager.sh",)),
     "fastdds": Component(fastdds, files=(BIN / "fastdds-peer", HOME / "fastdds" / "root"), locks=(FASTDDS_PEER,)),
     "mongo": Component(mongo, files=(BIN / "mongod",)),
     "jre": Component(jre, files=(HOME / "jre" / "bin" / "java",)),

@@ -2,7 +2,7 @@
 """Writes python.lock: the versions and checksums of all Python packages that the tests use.
 
   scripts/services.d/lock_python.py schemathesis==4.32.5 openapi-python-client==0.29.1
-  scripts/services.d/lock_python.py --of FOLDER NAME.lock     all packages of a virtual environment, into another file
+  scripts/services.d/lock_python.py --of FOLDER NAME.lock     all packages of a virtual environment, into another file (from here)
 
 The packages are those for Linux on x86_64 and the Pythons below, as the configured registry has them.
 """
@@ -17,7 +17,7 @@ PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux2014_x86_64", "manylinux_2_17_x86_64", "any")
 LOCK = Path(__file__).with_name("python.lock")
 HEAD = """\
-# Python packages of the tests, for scripts/services. Written by:
+# Python packages with their checksums. Written by:
 # scripts/services.d/lock_python.py {wanted}
 """
 
@@ -56,7 +56,7 @@ def resolved(wanted: list[str], python: str, *options: str) -> dict[str, tuple[s
 def main(arguments: list[str]) -> int:
     lock, wanted, options = LOCK, arguments, []
     if arguments[:1] == ["--of"] and len(arguments) == 3:
-        lock, wanted, options = LOCK.with_name(arguments[2]), installed(arguments[1]), ["--no-deps"]
+        lock, wanted, options = LOCK.parent / arguments[2], installed(arguments[1]), ["--no-deps"]
     if not wanted or any("==" not in package for package in wanted):
         print(__doc__, file=sys.stderr)
         return 2
