@@ -1,5 +1,5 @@
-//! `blaze why --server`: the way of a topic from the publisher to the consumer, by the flows of both
-//! ends.
+//! `blaze why --server`: the way of a topic from the publisher to the consumer, by the flows of
+//! both ends.
 
 use std::collections::BTreeMap;
 

@@ -1,5 +1,5 @@
-//! What the main service knows from the monitors of all nodes: the fleet at a glance, problems, why a
-//! topic does not arrive.
+//! What the main service knows from the monitors of all nodes: the fleet at a glance, problems, why
+//! a topic does not arrive.
 
 use std::collections::VecDeque;
 use std::time::Duration;

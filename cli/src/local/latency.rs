@@ -73,6 +73,8 @@ impl Offsets<'_> {
         let matrix = match answer {
             Ok(matrix) => matrix,
             Err(reason) => {
+                // Clocks drift: what was known holds no longer.
+                meter.lock().set_peers(BTreeMap::new());
                 self.away(&reason, format);
                 return Ok(());
             }

@@ -1,5 +1,5 @@
-//! Latency of messages as they arrive: by the clocks where their offset is known well enough, else by
-//! the age that flows have added up. Pure; the rules are those of the monitor.
+//! Latency of messages as they arrive: by the clocks where their offset is known well enough, else
+//! by the age that flows have added up. Pure; the rules are those of the monitor.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;

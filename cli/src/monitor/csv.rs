@@ -1,5 +1,5 @@
-//! Raw samples in a file: a heading, then one line a sample. Cells are names and numbers, which need
-//! no quotes.
+//! Raw samples in a file: a heading, then one line a sample. Cells are names and numbers, which
+//! need no quotes.
 
 use std::fmt::Display;
 use std::fs::File;

@@ -24,7 +24,8 @@ fn answer() -> Value {
                 {"where": "brokers", "p50_ms": 2, "p99_ms": 5}]})
     };
     json!({"layer": "cloud", "node": "cloud-1", "topics": [
-        row("imu/data", "edge/robot-1"), row("imu/data", "edge/robot-2"), row("odom", "edge/robot-1")]})
+        row("imu/data", "edge/robot-1"), row("imu/data", "edge/robot-2"),
+        row("odom", "edge/robot-1")]})
 }
 
 #[test]

@@ -3,7 +3,7 @@
 //! ```text
 //! ping, latency, problems ──► admin port of blaze-monitor ──► output, CSV
 //! problems --server ────────► REST of the main service
-//! latency --subscribe ──────► local: a service on the local broker; offsets of clocks from /v1/ping
+//! latency --subscribe ──────► local: a service on the local broker; clocks from /v1/ping
 //! ```
 
 mod csv;

@@ -196,8 +196,8 @@ async fn ping(options: &PingOptions, to: &FlowId, format: Format) -> Result<Exit
 fn with_advice(error: CliError, monitor: &FlowAddress) -> CliError {
     match &error {
         CliError::Refused { status: 404, .. } => error.advised(format!(
-            "`blaze ping --monitor {monitor}` lists the nodes that it knows; the other node needs a \
-             blaze-monitor, too."
+            "`blaze ping --monitor {monitor}` lists the nodes that it knows; the other node needs \
+             a blaze-monitor, too."
         )),
         CliError::Refused { status: 409, .. } => error.advised("Try again when it is done."),
         _ => error,

@@ -41,8 +41,8 @@ fn the_matrix_is_a_table() {
         {"layer": "fog", "node": "fog-1", "latency_ms": {"last": 10.111, "p50": 10.0, "p99": 12.5},
             "sent": 20, "lost": 1, "clock_offset_ms": -2999.9876, "clock_error_ms": 0.412,
             "clock_source": "ping", "last_ago_s": 3.4},
-        {"layer": "cloud", "node": "cloud-1", "latency_ms": {"last": null, "p50": null, "p99": null},
-            "sent": 1, "lost": 0, "clock_offset_ms": null, "clock_error_ms": null,
+        {"layer": "cloud", "node": "cloud-1",
+            "latency_ms": {"last": null, "p50": null, "p99": null}, "sent": 1, "lost": 0, "clock_offset_ms": null, "clock_error_ms": null,
             "clock_source": null, "last_ago_s": null}]});
     assert_eq!(
         matrix_table(&Matrix::deserialize(&matrix).unwrap(), None),

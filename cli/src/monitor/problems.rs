@@ -85,7 +85,7 @@ impl Source<'_> {
     }
 }
 
-/// Problems of the node and of its services, each with layer and node, as the main service has them.
+/// Problems of the node and of its services, with layer and node as the main service has them.
 fn of_health(health: &Value) -> Option<Vec<Value>> {
     let of_node = health.get("problems")?.as_array()?.iter();
     let of_services = list(health, "services").iter().flat_map(|s| list(s, "problems"));
