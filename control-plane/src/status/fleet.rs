@@ -207,7 +207,7 @@ impl Fleet {
             let kind = held.document.spec_member("kind").and_then(|kind| kind.as_str());
             let kind = kind.unwrap_or_default().to_owned();
             let health = match before.remove(&layer) {
-                Some(known) => LayerHealth { kind, ..known },
+                Some(known) => known.with_kind(kind),
                 None => LayerHealth::new(kind, now),
             };
             self.layers.insert(layer, health);

@@ -38,6 +38,11 @@ impl LayerHealth {
         Self { kind, health, nodes: Nodes::default(), down_since: None }
     }
 
+    /// The same layer, of a kind that may have changed.
+    pub(super) fn with_kind(self, kind: String) -> Self {
+        Self { kind, ..self }
+    }
+
     /// Its state.
     #[must_use]
     pub fn state(&self) -> Health {
