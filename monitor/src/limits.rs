@@ -8,8 +8,9 @@ use blaze_runtime::http::GetLimits;
 /// Between two looks at the flows and the worker: a change is seen, judged and reported within the
 /// 10 s in which somebody who injects a fault expects it.
 pub const LOOK: Duration = Duration::from_secs(1);
-/// Between two questions for what costs a flow more than its summary: peers, bridges, requesters.
-pub const LOOK_CLOSER: Duration = Duration::from_secs(5);
+/// Between two questions for what costs a flow more than its summary: peers, bridges, requesters. A
+/// problem is named 5 s after it was seen, so that a fault has a name within 10 s.
+pub const LOOK_CLOSER: Duration = Duration::from_secs(3);
 /// A flow or worker on this machine answers within this time, or counts as away.
 pub const ANSWER: GetLimits = GetLimits {
     connect: Duration::from_millis(500),

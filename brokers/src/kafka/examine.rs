@@ -18,8 +18,8 @@ const MAX_TOPICS: usize = 500;
 /// For the list of topics.
 const TIMEOUT: Duration = Duration::from_secs(3);
 
-/// Topics below the prefix that take smaller messages than the adapter's own do, with their limit in
-/// bytes: they were made by hand, or by a server that makes topics when somebody asks for them.
+/// Topics below the prefix that take smaller messages than the adapter's own do, with their limit
+/// in bytes: they were made by hand, or by a server that makes topics when somebody asks for them.
 /// Waits for the server, so call it on a thread that may.
 ///
 /// # Errors

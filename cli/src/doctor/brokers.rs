@@ -152,7 +152,8 @@ fn remedy(Place { key, shown }: &Place, reason: &str, file: &str) -> String {
             let server = shown.split(',').next().unwrap_or_default();
             format!(
                 "systemctl start kafka on {server} (kafka-broker-api-versions.sh \
-                 --bootstrap-server {server} answers when it runs), or set {key}.bootstrap in {file}"
+                 --bootstrap-server {server} answers when it runs), or set \
+                 {key}.bootstrap in {file}"
             )
         }
         "brokers.layer.dds" => format!("see the check dds_interface, or set {key} in {file}"),

@@ -291,7 +291,10 @@ mod tests {
 
     #[test]
     fn a_token_is_for_a_worker_of_the_layer_and_still_lives() {
-        let claims = |left: i64, layer: &str, role: &str| json!({"exp": NOW_S + left, "layer": layer, "roles": [role]});
+        let claims = |left: i64, layer: &str, role: &str| {
+            let end = NOW_S + left;
+            json!({"exp": end, "layer": layer, "roles": [role]})
+        };
         let good = claims(30 * 86_400, "edge", "worker");
         assert_eq!(judge(0o600, &good).result, Outcome::Ok);
         let open = judge(0o644, &good);

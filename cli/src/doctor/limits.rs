@@ -12,8 +12,8 @@ pub(super) const BROKER: Duration = Duration::from_secs(5);
 pub(super) const CLOSE: Duration = Duration::from_secs(1);
 /// Between two looks at a counter, to see whether it rises.
 pub(super) const APART: Duration = Duration::from_secs(1);
-/// For the answer to one probe of the MTU: more than the round trip over a geostationary satellite
-/// would need every probe to be three times as long, and such links are rare between flows.
+/// For the answer to one probe of the MTU: longer than the round trip of mobile networks. The path
+/// over a geostationary satellite (600 ms) is reported as not measured.
 pub(super) const MTU_ANSWER: Duration = Duration::from_millis(400);
 /// Probes of one size before it counts as lost: a lossy link must not look like a narrow one.
 pub(super) const MTU_TRIES: usize = 3;

@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! node file ─► file ─► Node ─┬► programs: admin ports of flow, worker, monitor, main service
-//!                            ├► file, brokers, network, mtu, peers, flows, sync, machine, credentials
+//!                            ├► file, brokers, network, mtu, peers, flows, sync, machine,
+//!                            │  credentials:
 //!                            │    probe ─► facts ─► judgement ─► Finding
 //!                            └► Check: the worst of the findings ─► output
 //! ```

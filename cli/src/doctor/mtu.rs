@@ -150,8 +150,8 @@ fn measure(
     }
 }
 
-/// The largest of the common sizes below `mtu` that arrives, in as few steps as can be: hosts answer
-/// only some packets a second.
+/// The largest of the common sizes below `mtu` that arrives, in as few steps as can be: hosts
+/// answer only some packets a second.
 fn widest(mtu: usize, send: &mut impl FnMut(usize) -> Sent) -> usize {
     let smaller: Vec<usize> = COMMON.into_iter().filter(|size| *size < mtu).collect();
     let place = smaller.partition_point(|size| send(*size) != Sent::Arrived);

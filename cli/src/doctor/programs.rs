@@ -239,7 +239,8 @@ pub(super) mod tests {
     fn metrics_are_read_by_name_and_label() {
         let text = "# TYPE blaze_build_info gauge\n\
                     blaze_build_info{program=\"blaze-flow\",version=\"0.1.0\"} 1\n\
-                    blaze_flow_leases{kind=\"advertise\"} 3\nblaze_flow_leases{kind=\"request\"} 4\n\
+                    blaze_flow_leases{kind=\"advertise\"} 3\n\
+                    blaze_flow_leases{kind=\"request\"} 4\n\
                     blaze_flow_leases_more 9\nplain 2.5\n";
         let flow = running(Kind::Flow, json!({"flow": "edge/a"}), text);
         assert_eq!(flow.version(), Some("0.1.0"));

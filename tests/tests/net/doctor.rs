@@ -1,5 +1,5 @@
-//! `blaze doctor` where the machine is not as it should be: each fault is named, and what it says to
-//! do helps.
+//! `blaze doctor` where the machine is not as it should be: each fault is named, and the remedy
+//! helps.
 
 use std::path::Path;
 use std::process::{Command, Output};

@@ -1,5 +1,5 @@
-//! `blaze doctor` beside a flow on a real Redis: nothing fails while all is well, and what is broken
-//! is named.
+//! `blaze doctor` beside a flow on a real Redis: nothing fails while all is well, and a broken
+//! broker is named.
 
 use std::net::SocketAddr;
 
