@@ -118,11 +118,15 @@ impl<'a> Sample<'a> {
     }
 
     fn labelled(&self, more: &[(&str, &str)]) -> String {
-        let mut labels: Vec<String> =
-            more.iter().map(|(name, value)| format!("{name}={value:?}")).collect();
+        let mut labels = Vec::new();
         let mut own = self.labels.to_owned();
-        for (name, _) in more {
+        for (name, value) in more {
+            let label = format!("{name}={value:?}");
+            if label_at(&own, name).is_some_and(|rest| rest.starts_with(&label)) {
+                continue;
+            }
             own = renamed(&own, name);
+            labels.push(label);
         }
         if !own.is_empty() {
             labels.push(own);
@@ -151,15 +155,20 @@ fn outside_of_values(text: &str) -> impl Iterator<Item = (usize, u8)> {
     })
 }
 
+/// The labels from the one of a name on.
+fn label_at<'a>(labels: &'a str, name: &str) -> Option<&'a str> {
+    let commas = outside_of_values(labels).filter(|(_, byte)| *byte == b',');
+    let starts = std::iter::once(0).chain(commas.map(|(at, _)| at + 1));
+    let mut rests = starts.map(|at| &labels[at..]);
+    rests.find(|rest| rest.strip_prefix(name).is_some_and(|rest| rest.starts_with('=')))
+}
+
 /// The labels with one of a name renamed.
 fn renamed(labels: &str, name: &str) -> String {
-    let starts = std::iter::once(0)
-        .chain(outside_of_values(labels).filter(|(_, byte)| *byte == b',').map(|(at, _)| at + 1));
-    let clash = starts
-        .map(|at| (at, &labels[at..]))
-        .find(|(_, rest)| rest.strip_prefix(name).is_some_and(|rest| rest.starts_with('=')));
-    match clash {
-        Some((at, rest)) => format!("{}exported_{rest}", &labels[..at]),
+    match label_at(labels, name) {
+        Some(rest) => {
+            format!("{}exported_{rest}", &labels[..labels.len() - rest.len()])
+        }
         None => labels.to_owned(),
     }
 }
@@ -178,7 +187,7 @@ mod tests {
         );
         merged.add(
             "# HELP a_total A.\n# TYPE a_total counter\na_total{program=\"own\",z=\"1\"} 3\n\
-             # TYPE h gauge\nh 1\nstray 4 1700000000000\n",
+             a_total{z=\"2\",program=\"blaze-worker\"} 4\n# TYPE h gauge\nh 1\nstray 4 1700000000000\n",
             &[("program", "blaze-worker")],
         );
         assert_eq!(
@@ -187,6 +196,7 @@ mod tests {
              a_total{program=\"blaze-flow\"} 1\n\
              a_total{program=\"blaze-flow\",x=\"}\\\",y\"} 2\n\
              a_total{program=\"blaze-worker\",exported_program=\"own\",z=\"1\"} 3\n\
+             a_total{z=\"2\",program=\"blaze-worker\"} 4\n\
              # TYPE h histogram\nh_bucket{program=\"blaze-flow\",le=\"+Inf\"} 1\n\
              h_sum{program=\"blaze-flow\"} 0.5\nh_count{program=\"blaze-flow\"} 1\n\
              # TYPE stray untyped\nstray{program=\"blaze-worker\"} 4 1700000000000\n"

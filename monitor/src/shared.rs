@@ -27,6 +27,8 @@ use crate::services::Signs;
 use crate::settings::LiveSettings;
 
 metrics! {
+    BUILD_INFO Gauge "blaze_build_info" ["version", "program"] "1"
+        "1, with the version as label."
     SAMPLE_SECONDS Gauge "blaze_monitor_sample_seconds" [] "seconds"
         "Time that the newest sample of the node's values took."
     REPORT_CONNECTED Gauge "blaze_monitor_report_connected" [] "1"
@@ -287,6 +289,8 @@ impl Shared {
         ] {
             page.add(metric, [], Number::Number(value));
         }
+        let build = [env!("CARGO_PKG_VERSION"), "blaze-monitor"];
+        page.add(&BUILD_INFO, build, Number::Number(1.0));
         page.text()
     }
 }

@@ -112,9 +112,11 @@ fn seconds() -> i64 {
     if std::env::var_os("BLAZE_LONG").is_some() { 3_600 } else { 120 }
 }
 
-#[test]
-fn a_thousand_nodes_receive_few_messages() {
-    thousand_nodes(1, seconds());
+mod long {
+    #[test]
+    fn a_thousand_nodes_of_one_edge_layer_receive_few_messages() {
+        super::thousand_nodes(1, super::seconds());
+    }
 }
 
 #[test]
