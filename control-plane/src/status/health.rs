@@ -114,6 +114,8 @@ impl<T: Ord + Copy> Damped<T> {
             return false;
         }
         self.set(least, now);
+        // What is beyond that has to hold on its own.
+        self.pending = (seen != least).then_some(Pending { worse, since: now.at, least: seen });
         true
     }
 }
