@@ -105,11 +105,14 @@ where
     B: AsRef<[u8]>,
 {
     let address = address.to_string();
-    let (status, body) = answer.map_err(|error| match error {
-        GetError::Unreachable(reason) => {
-            CliError::CannotConnect { program, address: address.clone(), reason }
+    let (status, body) = answer.map_err(|error| {
+        let (address, reason) = (address.clone(), error.to_string());
+        match error {
+            GetError::Unreachable(_) => CliError::CannotConnect { program, address, reason },
+            GetError::Answer(_) | GetError::TooLarge(_) => {
+                CliError::Answer { program, address, reason }
+            }
         }
-        GetError::Answer(reason) => CliError::Answer { program, address: address.clone(), reason },
     })?;
     match status {
         200 => Ok(body),

@@ -17,7 +17,7 @@ use futures::StreamExt as _;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use crate::limits::{ANSWER, MAX_PAGE_BYTES, MAX_PAGES};
+use crate::limits::{ALL_PAGES, ANSWER, MAX_ALL_PAGES_BYTES, MAX_PAGE_BYTES, MAX_PAGES};
 use crate::page::Merged;
 use crate::ping::OrderError;
 use crate::shared::Shared;
@@ -91,6 +91,11 @@ async fn ping(State(shared): App, body: Bytes) -> Response {
         return refusal(StatusCode::BAD_REQUEST, "invalid_request", &detail);
     };
     let interval = Duration::from_millis(order.interval_ms);
+    if !shared.pings.are_sent() {
+        let detail = "this monitor is on no broker, so it sends no pings: give brokers.node or \
+                      brokers.layer in the node file";
+        return refusal(StatusCode::SERVICE_UNAVAILABLE, "no_broker", detail);
+    }
     match shared.pings.order(to, order.count, interval).await {
         Ok(samples) => Json(shared.answer(json!({"samples": samples}))).into_response(),
         Err(error) => {
@@ -113,8 +118,13 @@ async fn all_pages(shared: &Shared, own: &str) -> String {
     let asked = asked(shared);
     let pages: Vec<_> = futures::stream::iter(asked)
         .map(page_of)
-        .buffered(AT_ONCE)
+        .buffer_unordered(AT_ONCE)
         .filter_map(|page| async { page })
+        .take_until(tokio::time::sleep(ALL_PAGES))
+        .scan(0, |bytes, page| {
+            *bytes += page.0.len();
+            std::future::ready((*bytes <= MAX_ALL_PAGES_BYTES).then_some(page))
+        })
         .collect()
         .await;
     let mut merged = Merged::default();

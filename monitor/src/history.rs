@@ -11,28 +11,28 @@ use crate::limits::{HISTORY_SERIES, HISTORY_STEP, HISTORY_VALUES};
 /// The last hour. Values are kept with seven digits.
 #[derive(Debug, Default)]
 pub struct History {
-    /// By name with labels, as in Prometheus' text. Each has as many values as there are times.
+    /// By name with labels, as in Prometheus' text.
     series: BTreeMap<String, VecDeque<f32>>,
-    /// When each was taken, in milliseconds since 1970.
-    times: VecDeque<u64>,
+    /// How many values each has.
+    times: usize,
+    /// When the newest were taken, in milliseconds since 1970.
+    newest_ms: Option<u64>,
     refused: u64,
 }
 
 impl History {
     /// Takes the values of now. A series without one has a gap; one without any for an hour goes.
     pub fn take(&mut self, at: SystemTime, values: impl IntoIterator<Item = (String, f64)>) {
-        let is_full = self.times.len() == HISTORY_VALUES;
-        if is_full {
-            self.times.pop_front();
-        }
+        let is_full = self.times == HISTORY_VALUES;
+        let before = if is_full { self.times - 1 } else { self.times };
         for ring in self.series.values_mut() {
             if is_full {
                 ring.pop_front();
             }
             ring.push_back(f32::NAN);
         }
-        let before = self.times.len();
-        self.times.push_back(millis(at));
+        self.times = before + 1;
+        self.newest_ms = Some(millis(at));
         for (name, value) in values {
             if let Some(ring) = self.series.get_mut(&name) {
                 if let Some(last) = ring.back_mut() {
@@ -71,7 +71,10 @@ impl History {
             .filter(|(name, _)| is_asked(name))
             .map(|(name, ring)| (name.clone(), ring.iter().map(|value| shown(*value)).collect()))
             .collect();
-        let start = self.times.front().map(|at| rfc3339_millis(*at));
+        // The newest value is the one whose time counts: a clock that stepped, or a machine that
+        // slept, moves the others.
+        let before = HISTORY_STEP.as_millis() as u64 * (self.times.saturating_sub(1)) as u64;
+        let start = self.newest_ms.map(|newest| rfc3339_millis(newest.saturating_sub(before)));
         json!({"start": start, "step_s": HISTORY_STEP.as_secs(), "series": series})
     }
 }

@@ -2,6 +2,7 @@
 //! health. ARCHITECTURE.md has the map.
 
 pub mod admin;
+pub mod expiry;
 pub mod gather;
 pub mod health;
 pub mod history;

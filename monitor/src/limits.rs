@@ -19,6 +19,10 @@ pub const ANSWER: GetLimits = GetLimits {
 };
 /// Flows that are asked, at most: `monitor.flows` may be a name with many addresses.
 pub const MAX_FLOWS: usize = 64;
+/// For the name of a flow to be resolved.
+pub const RESOLVE: Duration = Duration::from_millis(500);
+/// Longest pause between two closer looks at a flow that needs long for them.
+pub const LOOK_CLOSER_AT_LEAST: Duration = Duration::from_secs(15);
 /// Blocked topics that a flow is asked about, at most, each look: one question each.
 pub const MAX_BLOCKED: usize = 20;
 
@@ -50,10 +54,16 @@ pub const QUERIES: usize = 8;
 pub const QUERY: Duration = Duration::from_secs(5);
 /// Largest answer and summary, in bytes.
 pub const MAX_ANSWER_BYTES: usize = 1024 * 1024;
+/// Problems of a summary, the worst ones, so that it stays below its largest size.
+pub const MAX_PROBLEMS: usize = 200;
 /// Largest summary, in bytes.
 pub const MAX_SUMMARY_BYTES: usize = 256 * 1024;
 
-/// Pages of other programs in `/metrics?all=1`: bytes of one, and services at most.
+/// Page of one other program in `/metrics?all=1`, in bytes.
 pub const MAX_PAGE_BYTES: usize = 8 * 1024 * 1024;
+/// All of them, in bytes.
+pub const MAX_ALL_PAGES_BYTES: usize = 32 * 1024 * 1024;
+/// For all of them: less than the 10 s after which Prometheus gives up.
+pub const ALL_PAGES: Duration = Duration::from_secs(8);
 /// Services whose pages go into `/metrics?all=1`, at most.
 pub const MAX_PAGES: usize = 256;

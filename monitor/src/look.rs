@@ -10,13 +10,13 @@ use serde_json::Value;
 use crate::gather::{self, Seen};
 use crate::health::OffsetInput;
 use crate::latency::FlowFigures;
-use crate::limits::{LOOK, LOOK_CLOSER};
+use crate::limits::{LOOK, LOOK_CLOSER, LOOK_CLOSER_AT_LEAST};
 use crate::ping::LinkOffset;
-use crate::programs::{FlowView, Programs, link_offsets, ping_requesters};
+use crate::programs::{Closeness, FlowView, Programs, link_offsets, ping_requesters};
 use crate::shared::Shared;
 
-/// A closer look comes at most so often that it takes this part of the time: one flow with
-/// thousands of topics needs longer to answer.
+/// A closer look comes at most so often that the answers of a flow take this part of its time: one
+/// with thousands of topics needs longer.
 const PART_OF_TIME: u32 = 20;
 
 /// Looks, for ever.
@@ -29,11 +29,18 @@ pub async fn run(shared: Arc<Shared>) {
         let is_closer = began >= next_closer;
         let settings = shared.live();
         let before = shared.programs();
-        let programs = Programs::look(&settings.flows, &settings.worker, &before, is_closer).await;
+        let closeness = match (is_closer, settings.subscribes()) {
+            (false, _) => Closeness::Summary,
+            (true, false) => Closeness::Closer,
+            (true, true) => Closeness::AllTopics,
+        };
+        let programs = Programs::look(&settings.flows, &settings.worker, &before, closeness).await;
         seen.note(&programs);
         if is_closer {
             follow_flows(&shared, &programs).await;
-            next_closer = began + LOOK_CLOSER.max(began.elapsed() * PART_OF_TIME);
+            let took = programs.flows.iter().map(|flow| flow.took).max().unwrap_or_default();
+            let pause = (took * PART_OF_TIME).clamp(LOOK_CLOSER, LOOK_CLOSER_AT_LEAST);
+            next_closer = began + pause;
         }
         judge(&shared, &programs, &seen);
         shared.set_programs(programs);

@@ -94,21 +94,19 @@ struct Sample<'a> {
 }
 
 impl<'a> Sample<'a> {
+    /// `None` where Prometheus would refuse the line, and with it the whole page.
     fn of(line: &'a str) -> Option<Self> {
         let end = line.find(['{', ' '])?;
         let (name, rest) = line.split_at(end);
-        match rest.strip_prefix('{') {
-            None => Some(Self { name, labels: "", value: rest }),
+        let sample = match rest.strip_prefix('{') {
+            None => Self { name, labels: "", value: rest },
             Some(inner) => {
                 let close = closing(inner)?;
                 let (labels, value) = (&inner[..close], &inner[close + 1..]);
-                value.starts_with(' ').then_some(Self {
-                    name,
-                    labels: labels.trim_end_matches(','),
-                    value,
-                })
+                Self { name, labels: labels.trim_end_matches(','), value }
             }
-        }
+        };
+        (is_name(name) && is_value(sample.value)).then_some(sample)
     }
 
     /// Whether it belongs to a family: histograms and summaries have lines with suffixes.
@@ -133,6 +131,20 @@ impl<'a> Sample<'a> {
         }
         format!("{}{{{}}}{}", self.name, labels.join(","), self.value)
     }
+}
+
+fn is_name(name: &str) -> bool {
+    let is_of_name = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'_' | b':');
+    name.bytes().all(is_of_name) && name.bytes().next().is_some_and(|first| !first.is_ascii_digit())
+}
+
+/// A number, and perhaps the time in milliseconds.
+fn is_value(text: &str) -> bool {
+    let mut words = text.split_ascii_whitespace();
+    text.starts_with(' ')
+        && words.next().is_some_and(|number| number.parse::<f64>().is_ok())
+        && words.next().is_none_or(|time| time.parse::<i64>().is_ok())
+        && words.next().is_none()
 }
 
 /// Where the labels end: the first brace outside of a value.
@@ -207,8 +219,11 @@ mod tests {
     #[test]
     fn what_is_no_page_does_no_harm() {
         let mut merged = Merged::default();
-        merged.add("\u{0}\n{\nx{y=\"\nx{\"}\n<html>\n# TYPE\n# HELP\n", &[("program", "p")]);
+        merged.add(
+            "\u{0}\n{\nx{y=\"\nx{\"}\n<html>\nNot Found\n1a 1\n# TYPE\n# HELP\n",
+            &[("program", "p")],
+        );
         assert_eq!(merged.text(), "");
-        assert_eq!(merged.refused(), 5);
+        assert_eq!(merged.refused(), 7);
     }
 }

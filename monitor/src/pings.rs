@@ -24,6 +24,12 @@ const LIFESPAN: Duration = Duration::from_secs(5);
 const AGAIN: Duration = Duration::from_secs(1);
 /// The name under which monitors publish pings.
 const SERVICE: &str = "blaze-monitor";
+/// Both clocks are read again if the two readings are further apart.
+const ONE_MOMENT: Duration = Duration::from_millis(1);
+/// So often at most.
+const CLOCK_READINGS: u32 = 10;
+/// Between two looks whether a request for pings is done.
+const DONE: Duration = Duration::from_millis(20);
 /// Media type of pings.
 const ENCODING: &str = "application/json";
 
@@ -33,6 +39,8 @@ pub struct Pings {
     started: Instant,
     /// Whether the kernel says that the clock is synchronised.
     synchronized: AtomicBool,
+    /// Whether they are sent: there is a broker.
+    are_sent: AtomicBool,
     /// Something is due earlier than it was.
     wake: Notify,
 }
@@ -48,18 +56,32 @@ impl Pings {
             engine: Mutex::new(engine),
             started,
             synchronized: AtomicBool::new(false),
+            are_sent: AtomicBool::new(false),
             wake: Notify::new(),
         }
     }
 
-    /// Both clocks.
+    /// Both clocks, as of one moment: a thread that loses the processor between the two readings
+    /// would see a step of the clock.
     #[must_use]
     pub fn now(&self) -> Now {
-        Now {
-            monotonic: self.started.elapsed(),
-            wall_ns: wall_ns(),
-            synchronized: self.synchronized.load(Ordering::Relaxed),
+        let synchronized = self.synchronized.load(Ordering::Relaxed);
+        let mut before = self.started.elapsed();
+        for _ in 0..CLOCK_READINGS {
+            let wall_ns = wall_ns();
+            let monotonic = self.started.elapsed();
+            if monotonic.saturating_sub(before) <= ONE_MOMENT {
+                return Now { monotonic, wall_ns, synchronized };
+            }
+            before = monotonic;
         }
+        Now { monotonic: before, wall_ns: wall_ns(), synchronized }
+    }
+
+    /// Whether pings are sent at all: only where the monitor is on a broker.
+    #[must_use]
+    pub fn are_sent(&self) -> bool {
+        self.are_sent.load(Ordering::Relaxed)
     }
 
     /// What the kernel says of the clock.
@@ -96,10 +118,10 @@ impl Pings {
         // Also when whoever asked is gone.
         let cancel = Cancel(|| self.with(|engine, _| engine.cancel_order(id)));
         let samples = loop {
-            if let Some(samples) = self.with(|engine, _| engine.take_samples(id)) {
+            if let Some(samples) = self.engine.lock().take_samples(id) {
                 break samples;
             }
-            tokio::time::sleep(Duration::from_millis(20)).await;
+            tokio::time::sleep(DONE).await;
         };
         drop(cancel);
         Ok(samples)
@@ -125,6 +147,7 @@ impl<F: FnMut()> Drop for Cancel<F> {
 
 /// Pings through a broker, for ever.
 pub async fn run(pings: Arc<Pings>, broker: LocalBroker, flow: FlowManager) {
+    pings.are_sent.store(true, Ordering::Relaxed);
     let mut requested = Tasks::default();
     let mut advertised = Tasks::default();
     let mut publishers: BTreeMap<TopicName, Publisher> = BTreeMap::new();
@@ -140,16 +163,10 @@ pub async fn run(pings: Arc<Pings>, broker: LocalBroker, flow: FlowManager) {
             requested.start(topic, task);
         }
         for topic in changes.advertise {
-            match publisher(&broker, &topic) {
-                Ok(publisher) => drop(publishers.insert(topic.clone(), publisher)),
-                Err(error) => tracing::error!(%error, %topic, "pings cannot be published"),
-            }
             advertised.start(topic.clone(), advertise(flow.clone(), topic));
         }
         for output in outputs {
-            if let Some(publisher) = publishers.get(&output.topic()) {
-                publisher.publish(output.payload());
-            }
+            publish(&mut publishers, &broker, &output);
         }
         tokio::select! {
             () = tokio::time::sleep(wait) => {}
@@ -157,6 +174,23 @@ pub async fn run(pings: Arc<Pings>, broker: LocalBroker, flow: FlowManager) {
             () = requested.ended() => {}
             () = advertised.ended() => {}
         }
+    }
+}
+
+/// Publishes, with the publisher of the topic; one that could not be made is tried again the next
+/// time.
+fn publish(publishers: &mut BTreeMap<TopicName, Publisher>, broker: &LocalBroker, output: &Output) {
+    let topic = output.topic();
+    let made = match publishers.remove(&topic) {
+        Some(publisher) => Ok(publisher),
+        None => publisher(broker, &topic),
+    };
+    match made {
+        Ok(publisher) => {
+            publisher.publish(output.payload());
+            publishers.insert(topic, publisher);
+        }
+        Err(error) => tracing::debug!(%error, %topic, "pings cannot be published"),
     }
 }
 

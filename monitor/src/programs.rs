@@ -2,13 +2,16 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
+use std::time::{Duration, Instant};
 
 use blaze_domain::{FlowId, LayerName};
 use blaze_runtime::http::{GetLimits, get};
 use futures::StreamExt as _;
 use serde_json::Value;
+use tokio::net::lookup_host;
+use tokio::time::timeout;
 
-use crate::limits::{ANSWER, MAX_BLOCKED, MAX_FLOWS};
+use crate::limits::{ANSWER, MAX_BLOCKED, MAX_FLOWS, RESOLVE};
 
 /// Questions at a time.
 const AT_ONCE: usize = 8;
@@ -32,8 +35,23 @@ pub struct FlowView {
     pub bridges: Vec<Value>,
     /// Rows of `/v1/topics` of those that flow, some seconds old.
     pub topics: Vec<Value>,
+    /// Rows of `/v1/topics` of those that nobody requests, if they were asked for.
+    pub unrequested: Vec<Value>,
     /// Answers to `/v1/why` about topics that are blocked, some seconds old.
     pub blocked: Vec<Value>,
+    /// How long it took to answer all but its summary, the last time.
+    pub took: Duration,
+}
+
+/// What is asked besides the summary.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Closeness {
+    /// Nothing.
+    Summary,
+    /// Peers, bridges, topics that flow, and why others are blocked.
+    Closer,
+    /// Besides, topics that nobody requests.
+    AllTopics,
 }
 
 impl FlowView {
@@ -70,13 +88,13 @@ pub struct Programs {
 
 impl Programs {
     /// Asks all of them. `before` is the last answer: what is asked more rarely is taken from it
-    /// unless `is_closer`.
-    pub async fn look(flows: &[String], worker: &str, before: &Self, is_closer: bool) -> Self {
+    /// where it is not asked now.
+    pub async fn look(flows: &[String], worker: &str, before: &Self, closeness: Closeness) -> Self {
         let addresses = addresses(flows).await;
         let flows = futures::stream::iter(addresses)
             .map(|address| {
                 let known = before.flows.iter().find(|flow| flow.address == address);
-                look_at_flow(address, known.cloned().unwrap_or_default(), is_closer)
+                look_at_flow(address, known.cloned().unwrap_or_default(), closeness)
             })
             .buffered(AT_ONCE);
         let (flows, worker) = tokio::join!(flows.collect::<Vec<_>>(), look_at_worker(worker));
@@ -99,9 +117,9 @@ async fn addresses(flows: &[String]) -> Vec<String> {
     for flow in flows {
         let found: Vec<SocketAddr> = match flow.parse::<SocketAddr>() {
             Ok(address) => vec![address],
-            Err(_) => match tokio::net::lookup_host(flow.as_str()).await {
-                Ok(found) => found.collect(),
-                Err(_) => Vec::new(),
+            Err(_) => match timeout(RESOLVE, lookup_host(flow.as_str())).await {
+                Ok(Ok(found)) => found.collect(),
+                Ok(Err(_)) | Err(_) => Vec::new(),
             },
         };
         match found.is_empty() {
@@ -115,7 +133,7 @@ async fn addresses(flows: &[String]) -> Vec<String> {
     out
 }
 
-async fn look_at_flow(address: String, before: FlowView, is_closer: bool) -> FlowView {
+async fn look_at_flow(address: String, before: FlowView, closeness: Closeness) -> FlowView {
     let (summary, ready) = tokio::join!(json(&address, "/v1/summary", ANSWER), readiness(&address));
     let summary = match summary {
         Ok(summary) => summary,
@@ -129,14 +147,23 @@ async fn look_at_flow(address: String, before: FlowView, is_closer: bool) -> Flo
         address: address.clone(),
         ..before
     };
-    if !is_closer {
+    if closeness == Closeness::Summary {
         return FlowView { summary: Some(summary), ..view };
     }
+    let began = Instant::now();
     let is_blocked = summary["topics"]["blocked"].as_u64().unwrap_or(0) > 0;
-    let (peers, bridges, topics, blocked) = tokio::join!(
+    let (peers, bridges, topics, unrequested, blocked) = tokio::join!(
         rows(&address, "/v1/peers", "peers"),
         rows(&address, "/v1/bridges", "bridges"),
         rows(&address, "/v1/topics?state=flowing", "topics"),
+        async {
+            match closeness {
+                Closeness::AllTopics => {
+                    rows(&address, "/v1/topics?state=no_request", "topics").await
+                }
+                Closeness::Summary | Closeness::Closer => Some(Vec::new()),
+            }
+        },
         async {
             match is_blocked {
                 true => blocked(&address).await,
@@ -144,12 +171,22 @@ async fn look_at_flow(address: String, before: FlowView, is_closer: bool) -> Flo
             }
         }
     );
-    FlowView { summary: Some(summary), peers, bridges, topics, blocked, ..view }
+    // What is not answered now stays as it was: no row would mean that nothing is there.
+    FlowView {
+        summary: Some(summary),
+        peers: peers.unwrap_or(view.peers),
+        bridges: bridges.unwrap_or(view.bridges),
+        topics: topics.unwrap_or(view.topics),
+        unrequested: unrequested.unwrap_or(view.unrequested),
+        blocked,
+        took: began.elapsed(),
+        ..view
+    }
 }
 
 /// Why the topics that are blocked do not flow, of the first ones.
 async fn blocked(address: &str) -> Vec<Value> {
-    let topics = rows(address, "/v1/topics?state=blocked", "topics").await;
+    let topics = rows(address, "/v1/topics?state=blocked", "topics").await.unwrap_or_default();
     let names = topics.iter().filter(|row| row["state"] == "blocked");
     let names = names.filter_map(|row| Some(row["topic"].as_str()?.to_owned()));
     let names: Vec<String> = names.take(MAX_BLOCKED).collect();
@@ -212,7 +249,7 @@ pub async fn ping_requesters(address: &str, layers: &BTreeSet<LayerName>) -> BTr
     let mut out = BTreeSet::new();
     for layer in layers {
         let path = format!("/v1/topics?topic=blaze/ping/{layer}");
-        for topic in rows(address, &path, "topics").await {
+        for topic in rows(address, &path, "topics").await.unwrap_or_default() {
             out.extend(requesters(layer, &topic));
         }
     }
@@ -247,15 +284,16 @@ pub fn link_offsets(peers: &[Value]) -> BTreeMap<FlowId, (f64, f64)> {
         .collect()
 }
 
-async fn rows(address: &str, path: &str, member: &str) -> Vec<Value> {
+/// The rows of an answer; `None`: there is none.
+async fn rows(address: &str, path: &str, member: &str) -> Option<Vec<Value>> {
     match json(address, path, ANSWER).await {
         Ok(mut body) => match body[member].take() {
-            Value::Array(rows) => rows,
-            _ => Vec::new(),
+            Value::Array(rows) => Some(rows),
+            _ => None,
         },
         Err(error) => {
             tracing::debug!(address, path, error, "no answer");
-            Vec::new()
+            None
         }
     }
 }

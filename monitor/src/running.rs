@@ -22,6 +22,7 @@ use blaze_runtime::{CheckStatus, Gate, Readiness, Supervisor, TaskPolicy};
 use blaze_sdk::{MetricsEndpoint, ProgramConfig, SdkError, ServiceManager, ServiceOptions};
 use parking_lot::Mutex;
 use tokio::sync::watch;
+use tokio::time::MissedTickBehavior;
 
 use crate::admin;
 use crate::health::Health;
@@ -155,8 +156,10 @@ impl RunningMonitor {
         let live = LiveSettings::of(file);
         self.shared.health.lock().set_thresholds(live.section.thresholds);
         self.shared.latency.lock().set_rules(live.section.latency.clone());
-        let period = Duration::from_secs_f64(live.section.ping_period_s);
-        self.shared.pings.with(|engine, now| engine.set_period(now, period));
+        if live.section.ping_period_s != self.shared.live().section.ping_period_s {
+            let period = Duration::from_secs_f64(live.section.ping_period_s);
+            self.shared.pings.with(|engine, now| engine.set_period(now, period));
+        }
         self.main.send_if_modified(|main| {
             let is_other = *main != live.main;
             main.clone_from(&live.main);
@@ -240,8 +243,11 @@ async fn sample(shared: Arc<Shared>, sampler: Sampler) {
 }
 
 async fn keep_history(shared: Arc<Shared>) {
+    let mut steps = tokio::time::interval(HISTORY_STEP);
+    steps.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    steps.tick().await;
     loop {
-        tokio::time::sleep(HISTORY_STEP).await;
+        steps.tick().await;
         shared.keep_history(SystemTime::now());
     }
 }
@@ -285,7 +291,9 @@ async fn on_broker(
     let signs: Arc<Signs> = Arc::clone(&shared.signs);
     match file.cache_redis().map(RedisKeys::open).transpose() {
         Ok(Some(keys)) => spawn(supervisor, "signs of life", read_records(keys, node, signs)),
-        Ok(None) | Err(_) => {
+        Ok(None) => spawn(supervisor, "signs of life", read_messages(broker, node, signs)),
+        Err(error) => {
+            tracing::error!(%error, "cache.redis cannot be used: signs of life are read as messages");
             spawn(supervisor, "signs of life", read_messages(broker, node, signs));
         }
     }

@@ -3,7 +3,7 @@
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use blaze_domain::FlowId;
-use blaze_domain::node_file::{Fault, MonitorSection, NodeBroker, NodeFile};
+use blaze_domain::node_file::{Fault, MonitorSection, NodeBroker, NodeFile, Observe};
 use blaze_runtime::main_service::MainService;
 
 /// What a monitor takes over while it runs.
@@ -38,6 +38,14 @@ impl LiveSettings {
         });
         let worker = reached(file.admin.worker).to_string();
         Self { section, flows, worker, main, expected: Expected::of(file) }
+    }
+}
+
+impl LiveSettings {
+    /// Whether a rule subscribes to topics.
+    #[must_use]
+    pub fn subscribes(&self) -> bool {
+        self.section.latency.iter().any(|rule| rule.observe == Observe::Subscribe)
     }
 }
 

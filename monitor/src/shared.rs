@@ -6,7 +6,6 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use blaze_domain::control::rfc3339_millis;
-use blaze_domain::node_file::Observe;
 use blaze_domain::{FlowId, TopicName};
 use blaze_runtime::Readiness;
 use parking_lot::Mutex;
@@ -14,9 +13,11 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 use tokio::sync::watch;
 
+use crate::expiry::{self, Ends};
 use crate::health::{self, Change, Health, Inputs, Moment};
 use crate::history::History;
 use crate::latency::{self, Latency};
+use crate::limits::MAX_PROBLEMS;
 use crate::metric::{Page, Value as Number, metrics, series_name};
 use crate::node::{self, Sample};
 use crate::ping;
@@ -175,14 +176,14 @@ impl Shared {
     /// Topics that flows here know, where a rule subscribes to topics by a pattern.
     #[must_use]
     pub fn known_topics(&self) -> BTreeSet<TopicName> {
-        let live = self.live();
-        let mut rules = live.section.latency.iter();
-        if !rules.any(|rule| rule.observe == Observe::Subscribe) {
+        if !self.live().subscribes() {
             return BTreeSet::new();
         }
         let programs = self.programs();
-        let rows = programs.flows.iter().flat_map(|flow| &flow.topics);
-        rows.filter_map(|row| row["topic"].as_str()?.parse().ok()).collect()
+        let rows =
+            programs.flows.iter().flat_map(|flow| flow.topics.iter().chain(&flow.unrequested));
+        let topics = rows.filter_map(|row| row["topic"].as_str()?.parse::<TopicName>().ok());
+        topics.filter(|topic| !topic.is_for_monitors_alone()).collect()
     }
 
     /// An answer with what each answer has.
@@ -257,6 +258,12 @@ impl Shared {
         self.history.lock().take(at, of_node.chain(of_pings));
     }
 
+    /// When token and certificates end. The files are small, and read at each scrape: they may have
+    /// been replaced.
+    fn ends(&self) -> Ends {
+        self.live().main.as_ref().map(expiry::ends).unwrap_or_default()
+    }
+
     /// The monitor's own page of metrics.
     #[must_use]
     pub fn page(&self) -> String {
@@ -289,6 +296,14 @@ impl Shared {
         ] {
             page.add(metric, [], Number::Number(value));
         }
+        let ends = self.ends();
+        if let Some(end) = ends.token {
+            page.add(&expiry::TOKEN_ENDS, [], Number::Number(end as f64));
+        }
+        for (file, end) in &ends.certificates {
+            let file = file.to_string_lossy();
+            page.add(&expiry::CERTIFICATE_ENDS, [&*file], Number::Number(*end as f64));
+        }
         let build = [env!("CARGO_PKG_VERSION"), "blaze-monitor"];
         page.add(&BUILD_INFO, build, Number::Number(1.0));
         page.text()
@@ -302,9 +317,10 @@ impl Site for Shared {
         let flows: Vec<&Value> =
             programs.flows.iter().filter_map(|flow| flow.summary.as_ref()).collect();
         json!({
-            "health": self.health(),
+            "health": self.answer(self.health.lock().body().bounded(MAX_PROBLEMS)),
             "node": {
-                "cpu_ratio": vitals.cpu_ratio, "memory_ratio": vitals.memory_ratio,
+                "cpu_ratio": vitals.cpu_ratio,
+                "memory_ratio": vitals.memory_ratio.map(|available| 1.0 - available),
                 "celsius": vitals.celsius_max.map(|(_, celsius)| celsius),
             },
             "flows": flows,
@@ -327,7 +343,8 @@ impl Site for Shared {
 /// Tables of all metrics that a monitor exports, for the documentation.
 #[must_use]
 pub fn all_metrics() -> Vec<&'static crate::metric::Metric> {
-    let tables = [node::METRICS, ping::METRICS, latency::METRICS, health::METRICS, METRICS];
+    let tables =
+        [node::METRICS, ping::METRICS, latency::METRICS, health::METRICS, expiry::METRICS, METRICS];
     tables.into_iter().flatten().copied().collect()
 }
 

@@ -112,8 +112,8 @@ impl Meter {
         let origin = message.origin();
         let from = match (origin.layer.parse(), origin.node.parse()) {
             (Ok(layer), Ok(node)) => FlowId::new(layer, node),
-            // A bare message is of this broker.
-            _ => self.own.clone(),
+            // Without a header it is of any host on the broker, whose clock is not known.
+            _ => return,
         };
         let (Some(writer), Some(sequence)) = (message.writer(), message.sequence()) else {
             return;

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use axum::body::Bytes;
-use http_body_util::{BodyExt as _, Full, Limited};
+use http_body_util::{BodyExt as _, Full, LengthLimitError, Limited};
 use hyper::header::{ACCEPT, CONTENT_TYPE, HOST};
 use hyper::{Method, Request};
 use hyper_util::rt::TokioIo;
@@ -28,9 +28,12 @@ pub enum GetError {
     /// No connection, or no answer in time.
     #[error("{0}")]
     Unreachable(String),
-    /// What came is no answer, or is too large.
+    /// What came is no answer.
     #[error("{0}")]
     Answer(String),
+    /// The answer has more bytes than are allowed.
+    #[error("the answer has more than {0} bytes")]
+    TooLarge(usize),
 }
 
 /// Gets `path`, which begins with a slash and may have a query, from `HOST:PORT`; IPv6 in brackets.
@@ -101,10 +104,11 @@ async fn exchange(
         let response =
             sender.send_request(request).await.map_err(|error| unexpected(error.to_string()))?;
         let status = response.status().as_u16();
-        let body = Limited::new(response.into_body(), most)
-            .collect()
-            .await
-            .map_err(|error| unexpected(error.to_string()))?;
+        let body = Limited::new(response.into_body(), most).collect().await;
+        let body = body.map_err(|error| match error.is::<LengthLimitError>() {
+            true => GetError::TooLarge(most),
+            false => unexpected(error.to_string()),
+        })?;
         Ok((status, body.to_bytes()))
     };
     tokio::pin!(answer, connection);

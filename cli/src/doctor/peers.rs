@@ -143,14 +143,14 @@ mod tests {
         Check::of("x", findings).result
     }
 
-    fn seen(rows: Value) -> Value {
+    fn seen(rows: &Value) -> Value {
         json!({"peers": rows, "link": {"endpoints": 1}, "gateway": {"gateways": []}})
     }
 
     #[test]
     fn each_configured_peer_has_to_be_up() {
         let configured = [Ipv4Addr::new(10, 0, 3, 1)];
-        let judge = |rows: Value| judge_peers(&seen(rows), &configured, 20, "blaze.yaml");
+        let judge = |rows: Value| judge_peers(&seen(&rows), &configured, 20, "blaze.yaml");
         let row =
             |state, address: &str| json!([{"flow": "fog/a", "state": state, "address": address}]);
         assert_eq!(outcome(&judge(row("up", "10.0.3.1"))), Outcome::Ok);
@@ -165,7 +165,7 @@ mod tests {
         // Without addresses nobody can tell.
         let unknown = json!([{"flow": "fog/a", "state": "up", "address": null}]);
         assert_eq!(outcome(&judge(unknown)), Outcome::Ok);
-        assert_eq!(outcome(&judge_peers(&seen(json!([])), &[], 20, "f")), Outcome::Skipped);
+        assert_eq!(outcome(&judge_peers(&seen(&json!([])), &[], 20, "f")), Outcome::Skipped);
     }
 
     #[test]

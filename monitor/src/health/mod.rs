@@ -44,6 +44,8 @@ use tracker::{Standing, Tracker};
 metrics! {
     HEALTH Gauge "blaze_health" ["scope", "name", "state"] "1"
         "1 for the present state of the node or service, 0 for the others."
+    PROBLEM Gauge "blaze_problem" ["scope", "code", "name"] "1"
+        "1 for each present problem; at most 256 names, the rest `_other`."
 }
 /// Label of what is beyond the bound of labels.
 const OTHER: &str = "_other";
@@ -142,6 +144,21 @@ pub struct Body {
     pub problems: Vec<Problem>,
     /// Services with theirs.
     pub services: Vec<ServiceBody>,
+}
+
+impl Body {
+    /// With at most so many problems, the worst ones first, of services last.
+    #[must_use]
+    pub fn bounded(mut self, most: usize) -> Self {
+        self.problems.truncate(most);
+        let mut left = most - self.problems.len();
+        self.services.truncate(most);
+        for service in &mut self.services {
+            service.problems.truncate(left);
+            left -= service.problems.len();
+        }
+        self
+    }
 }
 
 /// One service in [`Body`].
@@ -296,7 +313,19 @@ impl Health {
         let node = (Scope::Node, self.node.node.to_string(), self.node_state.state);
         let services = services.into_iter().map(|(name, state)| (Scope::Service, name, state));
         let rows = std::iter::once(node).chain(services);
-        gauge(rows)
+        let mut families = gauge(rows);
+        families.extend(self.problem_metric());
+        families
+    }
+
+    /// `blaze_problem`, without a family where there is none.
+    fn problem_metric(&self) -> Vec<MetricFamily> {
+        let Ok(gauge) = IntGaugeVec::new(PROBLEM.opts(), PROBLEM.labels) else { return Vec::new() };
+        for (count, problem) in self.problems().into_iter().enumerate() {
+            let name = if count < MAX_LABELS - 1 { problem.name.as_str() } else { OTHER };
+            gauge.with_label_values(&[problem.scope.as_str(), problem.code, name]).set(1);
+        }
+        gauge.collect()
     }
 }
 

@@ -9,8 +9,9 @@ pub(super) const ALL_ASKED: usize = 64;
 /// Nodes asked in one layer where not all are asked.
 pub(super) const PER_LAYER: usize = 8;
 /// Nodes asked in all layers together where not all are asked. Each asked node answers each that asks
-/// on one topic, so the pongs that a node receives grow with the square of this number.
-pub(super) const IN_ALL: usize = 16;
+/// on one topic, so the pongs that a node receives grow with the square of this number. Three layers
+/// have all of `PER_LAYER`.
+pub(super) const IN_ALL: usize = 24;
 /// Nodes asked because their topics are measured: as many as `ALL_ASKED`, which bounds the series.
 pub(super) const MEASURED: usize = 64;
 /// Known nodes: ten times the largest system that was simulated.

@@ -15,8 +15,8 @@ use std::time::Duration;
 
 use blaze_domain::FlowId;
 use blaze_proto::v1;
-use blaze_proto::v1::report_request::Msg as Said;
-use blaze_proto::v1::report_response::Msg as Heard;
+use blaze_proto::v1::report_request::Msg as Outgoing;
+use blaze_proto::v1::report_response::Msg as Incoming;
 use blaze_proto::v1::status_service_client::StatusServiceClient;
 use blaze_runtime::main_service::{Backoff, ConnectError, MainService, words};
 use tokio::sync::{mpsc, watch};
@@ -51,7 +51,7 @@ pub trait Site: Send + Sync + 'static {
     fn targets(&self) -> Targets;
 }
 
-/// Who reports.
+/// The node that reports.
 #[derive(Debug, Clone)]
 pub struct Reporter {
     /// Layer and node.
@@ -156,7 +156,7 @@ type Opened = (mpsc::Sender<v1::ReportRequest>, Streaming<v1::ReportResponse>);
 
 async fn open(reporter: &Reporter, service: &MainService) -> Result<Opened, StreamError> {
     let (channel, token) = service.connect().await?;
-    let (outgoing, said) = mpsc::channel(OUTGOING);
+    let (outgoing, requests) = mpsc::channel(OUTGOING);
     let hello = v1::MonitorHello {
         protocol: PROTOCOL,
         layer: reporter.me.layer.to_string(),
@@ -166,8 +166,8 @@ async fn open(reporter: &Reporter, service: &MainService) -> Result<Opened, Stre
         metrics_address: reporter.metrics_address.clone(),
     };
     // The channel is new: there is room.
-    let _ = outgoing.try_send(v1::ReportRequest { msg: Some(Said::Hello(hello)) });
-    let mut request = Request::new(ReceiverStream::new(said));
+    let _ = outgoing.try_send(v1::ReportRequest { msg: Some(Outgoing::Hello(hello)) });
+    let mut request = Request::new(ReceiverStream::new(requests));
     if let Some(token) = token {
         request.metadata_mut().insert("authorization", token);
     }
@@ -200,7 +200,7 @@ impl Stream<'_> {
         let mut answers = JoinSet::new();
         let end = |reason: &str| End { reason: reason.to_owned(), again: None };
         loop {
-            let heard = tokio::select! {
+            let message = tokio::select! {
                 () = tokio::time::sleep_until(rhythm.next()) => {
                     self.summary();
                     rhythm.sent(Instant::now());
@@ -211,22 +211,22 @@ impl Stream<'_> {
                     continue;
                 }
                 Some(Ok(answer)) = answers.join_next() => {
-                    self.send(Said::Answer(answer));
+                    self.send(Outgoing::Answer(answer));
                     continue;
                 }
                 _ = main.changed() => {
                     main.mark_changed();
                     return end("config.server was changed");
                 }
-                heard = self.incoming.message() => heard,
+                message = self.incoming.message() => message,
             };
-            match heard {
+            match message {
                 Ok(Some(v1::ReportResponse { msg })) => match msg {
-                    Some(Heard::Interest(interest)) => {
+                    Some(Incoming::Interest(interest)) => {
                         rhythm.interest(Instant::now(), interest.period_ms);
                     }
-                    Some(Heard::Query(query)) => self.ask(query, &mut answers),
-                    Some(Heard::GoAway(away)) => {
+                    Some(Incoming::Query(query)) => self.ask(query, &mut answers),
+                    Some(Incoming::GoAway(away)) => {
                         let again = Duration::from_millis(away.retry_after_ms.into());
                         return End { reason: away.reason, again: Some(again) };
                     }
@@ -243,13 +243,15 @@ impl Stream<'_> {
     fn summary(&self) {
         let json = self.site.summary();
         if json.len() > MAX_SUMMARY_BYTES {
-            self.state.too_large.fetch_add(1, Ordering::Relaxed);
+            if self.state.too_large.fetch_add(1, Ordering::Relaxed) == 0 {
+                tracing::warn!(bytes = json.len(), "a summary is above 256 KiB and is not sent");
+            }
             return;
         }
-        self.send(Said::Summary(v1::Summary { json }));
+        self.send(Outgoing::Summary(v1::Summary { json }));
     }
 
-    fn send(&self, msg: Said) {
+    fn send(&self, msg: Outgoing) {
         let _ = self.outgoing.try_send(v1::ReportRequest { msg: Some(msg) });
     }
 
@@ -257,7 +259,7 @@ impl Stream<'_> {
         let v1::Query { id, name } = query;
         if answers.len() >= QUERIES {
             let (status, json) = question::refusal(503, "too_many_queries", "8 are under way");
-            self.send(Said::Answer(v1::QueryAnswer { id, status, json }));
+            self.send(Outgoing::Answer(v1::QueryAnswer { id, status, json }));
             return;
         }
         let targets = self.site.targets();

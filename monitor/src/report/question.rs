@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use blaze_domain::FlowId;
-use blaze_runtime::http::{GetLimits, get};
+use blaze_runtime::http::{GetError, GetLimits, get};
 use serde_json::json;
 
 use crate::limits::{ANSWER, MAX_ANSWER_BYTES, QUERY};
@@ -61,6 +61,7 @@ pub(super) async fn answer(targets: &Targets, question: &str) -> (u32, String) {
             Ok(json) => (status.into(), json),
             Err(_) => refusal(502, "no_answer", "the answer is no text"),
         },
+        Err(GetError::TooLarge(_)) => refusal(413, "too_large", "the answer is above 1 MiB"),
         Err(error) => refusal(503, "no_answer", &format!("{address}: {error}")),
     }
 }
