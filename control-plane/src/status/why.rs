@@ -234,7 +234,7 @@ mod tests {
         json!({ "flow": flow, "step": step, "ok": ok, "code": code, "detail": detail })
     }
 
-    fn answer(flow: &str, verdict: &str, code: &str, steps: Vec<Value>) -> FlowAnswer {
+    fn answer(flow: &str, verdict: &str, code: &str, steps: &[Value]) -> FlowAnswer {
         let why = json!({
             "verdict": verdict, "code": code, "remedy": format!("remedy of {code}"), "steps": steps,
         });
@@ -258,7 +258,7 @@ mod tests {
             "edge/robot-1",
             "flowing",
             "ok",
-            vec![
+            &[
                 step("edge/robot-1", "advertise", true, "ok", "imu-driver, 50 Hz"),
                 step("cloud/cloud-1", "request", true, "ok", "as announced"),
                 step("edge/robot-1", "admit", true, "ok", ""),
@@ -270,7 +270,7 @@ mod tests {
             "cloud/cloud-1",
             "not_flowing",
             "broker_down",
-            vec![
+            &[
                 step("cloud/cloud-1", "deliver", false, "broker_down", "redis does not answer"),
                 step("edge/robot-1", "advertise", true, "ok", "from afar"),
             ],
@@ -315,7 +315,7 @@ mod tests {
             "edge/robot-1",
             "not_flowing",
             "no_request",
-            vec![
+            &[
                 step("edge/robot-1", "advertise", true, "ok", "imu-driver"),
                 step("cloud/cloud-1", "request", false, "no_request", "names of cloud"),
             ],
