@@ -4,6 +4,7 @@
 //! `cargo nextest run -p blaze-config --profile long -E 'test(long::)' --no-capture` prints the
 //! figures.
 
+#[cfg(test)]
 mod long {
     use std::net::SocketAddr;
     use std::path::Path;

@@ -62,6 +62,7 @@ macro_rules! metrics {
             labels: &[$($label),*],
         };)*
         /// All metrics of this module, in the order of the documentation.
+        #[allow(unreachable_pub, reason = "some of these modules are private")]
         pub static METRICS: &[&$crate::metric::Metric] = &[$(&$id),*];
     };
 }
@@ -176,7 +177,8 @@ impl Page {
 
     /// Adds whole families.
     pub fn extend(&mut self, families: impl IntoIterator<Item = MetricFamily>) {
-        self.more.extend(families);
+        // An empty one is an error to the encoder.
+        self.more.extend(families.into_iter().filter(|family| !family.get_metric().is_empty()));
     }
 
     /// The text.

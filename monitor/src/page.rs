@@ -44,7 +44,10 @@ impl Merged {
                     true => (name.as_str(), help.as_str(), kind.as_str()),
                     false => (sample.name, "", "untyped"),
                 };
-                self.sample(of, help, kind, sample.labelled(labels));
+                match sample.labelled(labels) {
+                    Some(line) => self.sample(of, help, kind, line),
+                    None => self.refused += 1,
+                }
             }
         }
     }
@@ -89,6 +92,8 @@ struct Sample<'a> {
     name: &'a str,
     /// Without braces.
     labels: &'a str,
+    /// Names of the labels.
+    names: Vec<&'a str>,
     /// With the space before it.
     value: &'a str,
 }
@@ -98,15 +103,17 @@ impl<'a> Sample<'a> {
     fn of(line: &'a str) -> Option<Self> {
         let end = line.find(['{', ' '])?;
         let (name, rest) = line.split_at(end);
-        let sample = match rest.strip_prefix('{') {
-            None => Self { name, labels: "", value: rest },
+        let (labels, value) = match rest.strip_prefix('{') {
+            None => ("", rest),
             Some(inner) => {
                 let close = closing(inner)?;
-                let (labels, value) = (&inner[..close], &inner[close + 1..]);
-                Self { name, labels: labels.trim_end_matches(','), value }
+                (inner[..close].trim_end_matches(','), &inner[close + 1..])
             }
         };
-        (is_name(name) && is_value(sample.value)).then_some(sample)
+        // What follows is an exemplar of OpenMetrics, which this format does not have.
+        let value = value.split(" # ").next().unwrap_or_default();
+        let names = label_names(labels)?;
+        (is_name(name) && is_value(value)).then_some(Self { name, labels, names, value })
     }
 
     /// Whether it belongs to a family: histograms and summaries have lines with suffixes.
@@ -115,22 +122,68 @@ impl<'a> Sample<'a> {
         suffix.is_some_and(|suffix| matches!(suffix, "" | "_bucket" | "_sum" | "_count" | "_total"))
     }
 
-    fn labelled(&self, more: &[(&str, &str)]) -> String {
+    /// The line with more labels; an own one of such a name is renamed `exported_…`, as Prometheus
+    /// does it. `None`: two labels would have one name.
+    fn labelled(&self, more: &[(&str, &str)]) -> Option<String> {
         let mut labels = Vec::new();
         let mut own = self.labels.to_owned();
-        for (name, value) in more {
+        let mut names = self.names.clone();
+        let renames: Vec<String> =
+            more.iter().map(|(name, _)| format!("exported_{name}")).collect();
+        for ((name, value), renamed) in more.iter().zip(&renames) {
             let label = format!("{name}={value:?}");
             if label_at(&own, name).is_some_and(|rest| rest.starts_with(&label)) {
                 continue;
             }
-            own = renamed(&own, name);
+            if let Some(at) = names.iter().position(|known| known == name) {
+                own = exported(&own, name);
+                names[at] = renamed;
+            }
+            names.push(name);
             labels.push(label);
         }
         if !own.is_empty() {
             labels.push(own);
         }
-        format!("{}{{{}}}{}", self.name, labels.join(","), self.value)
+        names.sort_unstable();
+        let are_different = names.windows(2).all(|pair| pair[0] != pair[1]);
+        are_different.then(|| format!("{}{{{}}}{}", self.name, labels.join(","), self.value))
     }
+}
+
+/// Names of labels; `None` where they are not `name="value"` with commas between.
+fn label_names(labels: &str) -> Option<Vec<&str>> {
+    let mut names = Vec::new();
+    let mut rest = labels;
+    while !rest.is_empty() {
+        let (name, after) = rest.split_once('=')?;
+        let value = after.strip_prefix('"')?;
+        let end = end_of_value(value)?;
+        is_name(name).then(|| names.push(name))?;
+        rest = &value[end + 1..];
+        rest = match rest.strip_prefix(',') {
+            Some(next) if !next.is_empty() => next,
+            None if rest.is_empty() => rest,
+            _ => return None,
+        };
+    }
+    Some(names)
+}
+
+/// Where the quote is that ends a value.
+fn end_of_value(value: &str) -> Option<usize> {
+    let mut is_escaped = false;
+    value.bytes().position(|byte| match (is_escaped, byte) {
+        (true, _) => {
+            is_escaped = false;
+            false
+        }
+        (false, b'\\') => {
+            is_escaped = true;
+            false
+        }
+        (false, byte) => byte == b'"',
+    })
 }
 
 fn is_name(name: &str) -> bool {
@@ -176,7 +229,7 @@ fn label_at<'a>(labels: &'a str, name: &str) -> Option<&'a str> {
 }
 
 /// The labels with one of a name renamed.
-fn renamed(labels: &str, name: &str) -> String {
+fn exported(labels: &str, name: &str) -> String {
     match label_at(labels, name) {
         Some(rest) => {
             format!("{}exported_{rest}", &labels[..labels.len() - rest.len()])
@@ -214,6 +267,26 @@ mod tests {
              # TYPE stray untyped\nstray{program=\"blaze-worker\"} 4 1700000000000\n"
         );
         assert_eq!(merged.refused(), 1);
+    }
+
+    #[test]
+    fn a_line_that_would_spoil_the_page_is_left_out() {
+        for (line, is_kept) in [
+            ("a 1", true),
+            ("a{x=\"1\"} 1 # {t=\"x\"} 1", true),
+            ("a{exported_program=\"0\",program=\"1\"} 1", false),
+            ("a{x=\"1\",x=\"2\"} 1", false),
+            ("a foo", false),
+            ("a 1 2 3", false),
+            ("a-b 1", false),
+            ("{\"json\":1} 5", false),
+            ("a{x=1} 5", false),
+            ("a{x=\"1\" y=\"2\"} 5", false),
+        ] {
+            let mut merged = Merged::default();
+            merged.add(line, &[("program", "p")]);
+            assert_eq!(merged.refused() == 0, is_kept, "{line}: {}", merged.text());
+        }
     }
 
     #[test]

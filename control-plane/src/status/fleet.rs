@@ -31,9 +31,6 @@ pub enum Presence {
     Gone,
 }
 
-/// Counts of links, by their two flows.
-type LinkCounts = BTreeMap<(FlowId, FlowId), u64>;
-
 /// A node that has reported since this process started.
 #[derive(Debug)]
 pub struct Entry {
@@ -46,11 +43,14 @@ pub struct Entry {
     /// Messages per second, from the last two summaries.
     pub rates: Rates,
     /// Messages that links had dropped by the summary before, where somebody looked at it.
-    pub dropped_before: Option<(Now, LinkCounts)>,
+    pub dropped_before: Option<(Now, DroppedByLink)>,
     /// Where its metrics are scraped; empty: not from outside.
     pub metrics_address: String,
     presence: Damped<Presence>,
 }
+
+/// Messages that links have dropped since their flows started, by the flows of both ends.
+pub type DroppedByLink = BTreeMap<(FlowId, FlowId), u64>;
 
 /// Messages per second.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

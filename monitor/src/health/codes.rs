@@ -83,7 +83,7 @@ pub static CODES: &[Code] = &[
         Down,
         "BlazeFlow of this node does not answer, or is not ready: no messages pass.",
         "Start it (`blaze-flow --config FILE`) or repair the broker that the detail names; \
-         `curl -s 127.0.0.1:9101/readyz` shows all checks.",
+         `/readyz` on its admin port (`admin.flow`) shows all checks.",
     ),
     row(
         Node,
@@ -92,7 +92,7 @@ pub static CODES: &[Code] = &[
         "The worker of this node does not answer, or is not ready: services get no new \
          configuration.",
         "Start it (`blaze-worker --config FILE`) or repair what the detail names; \
-         `curl -s 127.0.0.1:9102/readyz` shows all checks.",
+         `/readyz` on its admin port (`admin.worker`) shows all checks.",
     ),
     row(
         Node,

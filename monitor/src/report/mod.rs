@@ -216,7 +216,7 @@ impl Stream<'_> {
                 }
                 _ = main.changed() => {
                     main.mark_changed();
-                    return end("config.server was changed");
+                    return end("config or monitor.report was changed");
                 }
                 message = self.incoming.message() => message,
             };

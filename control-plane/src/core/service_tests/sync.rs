@@ -306,9 +306,13 @@ async fn what_a_worker_has_is_known_while_it_is_here_and_after() {
     let topology = w.service.topology(&w.admin, &read).await.unwrap().value;
     let node = &topology["layers"][0]["nodes"][0];
     assert_eq!(node["worker"]["in_sync"], true);
-    let slam =
-        json!({ "service": "slam", "instance": "0", "state": "ready", "config_revision": 1 });
-    assert_eq!(node["services"], json!([slam]));
+    // No monitor has reported.
+    let health = json!({ "state": "unknown", "since": null, "codes": [] });
+    let slam = json!({
+        "service": "slam", "instance": "0", "state": "ready", "config_revision": 1,
+        "health": health,
+    });
+    assert_eq!((&node["services"], &node["health"]), (&json!([slam]), &health));
 
     // What it has is old now, and nobody of another layer is told of it.
     w.put("Layer/edge", json!({ "kind": "edge" })).await;

@@ -9,6 +9,7 @@ use blaze_proto::v1::status_service_client::StatusServiceClient;
 use futures::Stream;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
+use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::codec::CompressionEncoding;
 use tonic::{Status, Streaming};
@@ -19,7 +20,20 @@ const SOON: Duration = Duration::from_secs(10);
 
 struct Monitor {
     requests: mpsc::Sender<v1::ReportRequest>,
-    responses: Streaming<v1::ReportResponse>,
+    responses: mpsc::Receiver<Result<Sent, Status>>,
+    /// Reads, as a connection would: without that nothing moves in either direction.
+    _reading: JoinSet<()>,
+}
+
+async fn read(
+    mut stream: Streaming<v1::ReportResponse>,
+    responses: mpsc::Sender<Result<Sent, Status>>,
+) {
+    while let Some(message) = stream.message().await.transpose() {
+        if responses.send(message.map(|message| message.msg.unwrap())).await.is_err() {
+            return;
+        }
+    }
 }
 
 fn hello(layer: &str, node: &str, epoch: u64) -> v1::MonitorHello {
@@ -59,8 +73,10 @@ impl Monitor {
             let value = format!("Bearer {token}").parse().unwrap();
             request.metadata_mut().insert("authorization", value);
         }
-        let responses = client.report(request).await?.into_inner();
-        Ok(Self { requests, responses })
+        let (sender, responses) = mpsc::channel(16);
+        let mut reading = JoinSet::new();
+        reading.spawn(read(client.report(request).await?.into_inner(), sender));
+        Ok(Self { requests, responses, _reading: reading })
     }
 
     async fn send(&self, message: Reported) {
@@ -72,8 +88,7 @@ impl Monitor {
     }
 
     async fn next(&mut self) -> Option<Result<Sent, Status>> {
-        let message = tokio::time::timeout(SOON, self.responses.message()).await.unwrap();
-        message.transpose().map(|message| message.map(|message| message.msg.unwrap()))
+        tokio::time::timeout(SOON, self.responses.recv()).await.unwrap()
     }
 }
 
@@ -359,13 +374,22 @@ async fn a_reader_that_does_not_read_costs_nothing() {
     assert_eq!(live.next_event().await.0, "snapshot");
     assert!(matches!(monitor.next().await, Some(Ok(Sent::Interest(_)))));
     // It reads no more: no interest is renewed, though ten seconds would ask for it.
-    let quiet = tokio::time::timeout(Duration::from_secs(12), monitor.responses.message()).await;
+    let quiet = tokio::time::timeout(Duration::from_secs(12), monitor.responses.recv()).await;
     assert!(quiet.is_err(), "{quiet:?}");
     // When it reads on, it gets one delta with the newest, not one for each period.
-    monitor.summary(summary("ok", &json!([]))).await;
-    let (name, patch) = live.next_event().await;
-    assert_eq!(name, "delta");
-    assert!(patch["nodes"]["robot-1"].is_object(), "{patch}");
+    for state in ["ok", "down", "degraded"] {
+        monitor.summary(summary(state, &json!([]))).await;
+    }
+    eventually("all were taken", async || {
+        let summaries = "blaze_config_status_summaries_total 3";
+        fixture.status_text().contains(summaries)
+    })
+    .await;
+    let (mut name, mut patch) = live.next_event().await;
+    if name == "bookmark" {
+        (name, patch) = live.next_event().await;
+    }
+    assert_eq!((name.as_str(), &patch["nodes"]["robot-1"]["state"]), ("delta", &json!("degraded")));
 }
 
 /// Events of a stream of REST.
@@ -393,6 +417,14 @@ impl Events {
 }
 
 impl Fixture {
+    fn status_text(&self) -> String {
+        let registry = prometheus::Registry::new();
+        for collector in self.core.status_metrics().collectors() {
+            registry.register(collector).unwrap();
+        }
+        prometheus::TextEncoder::new().encode_to_string(&registry.gather()).unwrap()
+    }
+
     async fn events(&self, path: &str) -> Events {
         let response = self.rest_response(path).await;
         assert_eq!(response.status(), 200, "{path}");
