@@ -16,7 +16,7 @@ use blaze_brokers::Broker;
 use blaze_brokers::redis::RedisKeys;
 use blaze_config::process::Setup;
 use blaze_config::running::{Addresses, RunningMain};
-use blaze_domain::node_file::{ControlPlaneSection, NodeFile, RedisBroker};
+use blaze_domain::node_file::{AdminSection, ControlPlaneSection, NodeFile, RedisBroker};
 use blaze_domain::{InstanceName, Scope};
 use blaze_flow::flow::RunningFlow;
 use blaze_flow::flow::node_file::Followed;
@@ -30,6 +30,7 @@ use blaze_worker::admin::Shown;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::WorkerSettings;
 use serde_json::Value;
+use tokio::net::TcpListener;
 use tokio::time::sleep;
 
 use crate::exit::{CliError, lines};
@@ -85,7 +86,8 @@ pub(crate) async fn follow(
     service.ok_or_else(|| refused("it has no broker of its node or layer".to_owned()))
 }
 
-/// Starts the monitor of a node whose flow is in this process, on the broker of its services.
+/// Starts the monitor of a node whose flow is in this process, on the broker of its services. Where
+/// its default port is taken, as by another `blaze dev`, it takes any.
 ///
 /// # Errors
 /// [`CliError::Failed`]: a port that cannot be used.
@@ -96,6 +98,10 @@ pub(crate) async fn start_monitor(
     supervisor: &Supervisor,
 ) -> Result<RunningMonitor, CliError> {
     file.admin.flow = flow;
+    let is_default = file.admin.monitor == AdminSection::default().monitor;
+    if is_default && TcpListener::bind(file.admin.monitor).await.is_err() {
+        file.admin.monitor.set_port(0);
+    }
     let address = file.admin.monitor;
     let broker = Some((Scope::Node, broker));
     let options = MonitorOptions { file, roots: Roots::default(), broker };

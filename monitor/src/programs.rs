@@ -101,6 +101,22 @@ impl Programs {
         Self { flows, worker }
     }
 
+    /// States of the flows and of their links, by their names.
+    #[must_use]
+    pub fn states(&self) -> BTreeMap<String, String> {
+        let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
+        let summaries = self.flows.iter().filter_map(|flow| flow.summary.as_ref());
+        let states = summaries.flat_map(|summary| {
+            let flow = text(&summary["flow"]);
+            let links = summary["links"].as_array().into_iter().flatten();
+            let links: Vec<(String, String)> = links
+                .map(|link| (format!("{flow}>{}", text(&link["flow"])), text(&link["state"])))
+                .collect();
+            links.into_iter().chain([(flow, text(&summary["state"]))])
+        });
+        states.collect()
+    }
+
     /// Layers that a flow here knows, with their own ones.
     #[must_use]
     pub fn layers(&self) -> BTreeSet<LayerName> {
@@ -345,6 +361,20 @@ mod tests {
             ready(true, b"no json"),
             Ready { is_reachable: true, is_ready: true, ..Ready::default() }
         );
+    }
+
+    #[test]
+    fn another_state_of_a_link_is_another_state() {
+        let programs = |state: &str| {
+            let links = json!([{"flow": "fog/f", "state": state, "rtt_ms": 1.0}]);
+            let summary = json!({"flow": "edge/a", "state": "ready", "links": links});
+            let flow = FlowView { summary: Some(summary), ..FlowView::default() };
+            Programs { flows: vec![flow], ..Programs::default() }
+        };
+        let states = programs("up").states();
+        assert_eq!(states["edge/a>fog/f"], "up");
+        assert_eq!(states["edge/a"], "ready");
+        assert_ne!(states, programs("down").states());
     }
 
     #[test]

@@ -138,9 +138,13 @@ impl Shared {
         self.programs.subscribe()
     }
 
-    /// Replaces it.
+    /// Replaces it. Another state of a flow or a link is reported at once, as that of health is.
     pub fn set_programs(&self, programs: Programs) {
-        self.programs.send_replace(Arc::new(programs));
+        let states = programs.states();
+        let before = self.programs.send_replace(Arc::new(programs));
+        if before.states() != states {
+            self.changed.send_modify(|count| *count += 1);
+        }
     }
 
     /// Marked at each change of health.

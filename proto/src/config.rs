@@ -267,15 +267,16 @@ mod tests {
     }
 
     #[test]
-    fn the_descriptors_hold_both_services_whole() {
+    fn the_descriptors_hold_all_services_whole() {
         let set = google::FileDescriptorSet::decode(crate::CONFIG_DESCRIPTORS).unwrap();
-        let services: Vec<_> = set
+        let mut services: Vec<_> = set
             .file
             .iter()
             .flat_map(|file| &file.service)
             .map(google::ServiceDescriptorProto::name)
             .collect();
-        assert_eq!(services, ["ConfigService", "SyncService"]);
+        services.sort_unstable();
+        assert_eq!(services, ["ConfigService", "StatusService", "SyncService"]);
         assert!(set.file.iter().any(|file| file.name() == "google/protobuf/timestamp.proto"));
         assert!(!set.file.iter().any(|file| file.name().contains("control.proto")));
     }

@@ -467,7 +467,11 @@ fn the_metric_is_1_for_one_state_of_each_and_its_names_are_bounded() {
     let mut bench = Bench::new();
     bench.run(7, &inputs);
     let families = bench.health.metrics();
-    let [family] = &families[..] else { panic!("one family") };
+    let [family, problems] = &families[..] else { panic!("two families") };
+    let [problem] = problems.get_metric() else { panic!("one problem") };
+    let labels: Vec<&str> =
+        problem.get_label().iter().map(prometheus::proto::LabelPair::value).collect();
+    assert_eq!(labels, ["service_unhealthy", "s399/0", "service"]);
     let mut sums: BTreeMap<(String, String), f64> = BTreeMap::new();
     let mut present = BTreeMap::new();
     for metric in family.get_metric() {

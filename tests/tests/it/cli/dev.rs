@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use crate::cli::stage::{PATIENCE, Stage, ready};
 
 /// Ports that nobody else has.
-const ANY: [&str; 9] = [
+const ANY: [&str; 11] = [
     "dev",
     "--rest",
     "127.0.0.1:0",
@@ -27,6 +27,8 @@ const ANY: [&str; 9] = [
     "admin.flow=127.0.0.1:0",
     "--set",
     "admin.worker=127.0.0.1:0",
+    "--set",
+    "admin.monitor=127.0.0.1:0",
 ];
 const ANY_MAIN: [&str; 2] = ["--set", "control_plane.admin.listen=127.0.0.1:0"];
 

@@ -50,7 +50,9 @@ fn rows<'a>(value: &'a Value, key: &str) -> &'a Vec<Value> {
 fn topics(admin: &Admin) {
     let identity = "layer:s node:s service:s instance:s scope:s broker:s? local:b";
     let answer = ask(admin, "/v1/topics");
-    for row in rows(&answer, "topics") {
+    // Pings of a layer may have a requester before a monitor elsewhere publishes any.
+    let is_of_users = |row: &&Value| !row["topic"].as_str().unwrap().starts_with("blaze/");
+    for row in rows(&answer, "topics").iter().filter(is_of_users) {
         check(row, "topic:s state:s rate_hz:n bytes_per_s:n advertised:a requested:a");
         assert!(
             ["flowing", "no_request", "no_advertise", "blocked"]
