@@ -247,7 +247,7 @@ fn attack() {
     );
     // A newcomer finds the flow, whatever life it is in, and reaches it.
     let cloud = start(domain, "cloud/cloud-1", 1);
-    let life = wait_for("the flow after the attack", Duration::from_secs(10), || {
+    let life = wait_for("the flow after the attack", Duration::from_secs(30), || {
         let found = |epoch| endpoint("edge/robot-1", epoch);
         let events = cloud.events.lock();
         (1..100).map(found).rev().find(|it| {
