@@ -7,9 +7,13 @@ use blaze_brokers::{Broker, Health, OpenError, Role, open_layer, open_node};
 use blaze_domain::node_file::{LayerBroker, NodeBroker, RedisBroker};
 use tokio::time::timeout;
 
-use super::check::{Finding, named};
+use super::Node;
+use super::check::Finding;
+#[cfg(feature = "kafka")]
+use super::check::named;
 use super::limits::{BROKER, CLOSE};
-use super::{Node, on_thread};
+#[cfg(feature = "kafka")]
+use super::on_thread;
 
 /// A broker of the node file: its key, and its place without credentials.
 #[derive(Debug, Clone, PartialEq, Eq)]
